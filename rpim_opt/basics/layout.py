@@ -187,13 +187,9 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     heads, above = _heads(grid, numeric, options)
     begins = {i: "".join(filter(str.isalpha, next(filter(None, grid.rows[i])))) for i in numeric}
     full = [i for i in numeric if begins[i].lower() not in SUMMARIES]
-    units: dict[str, str] = {}
-    lines_of_units = []
-    for row in grid.rows[: above[0] if above else 0]:
-        stated = _stated_units(row)
-        if stated:
-            units = stated
-            lines_of_units.append(f"units above the header: {' '.join(filter(None, row))}.")
+    stated = [(row, _stated_units(row)) for row in grid.rows[: above[0] if above else 0]]
+    units = next((units for _, units in reversed(stated) if units), {})
+    lines_of_units = [f"units above the header: {' '.join(filter(None, row))}." for row, of_row in stated if of_row]
     table = _columns([grid.rows[i] for i in full], heads, replace(options, units={**units, **options.units}))
     left = set(range(numeric[0], len(grid.rows))).difference(full)
     notes = (*grid.notes, *_notes(grid, above, left, options), *lines_of_units, *table.notes)

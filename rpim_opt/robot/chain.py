@@ -111,19 +111,26 @@ def describe(
     return table + 0.0, base, turns[-1].T @ chain.tail, G
 
 
-def corrected(G: Array, table: Array, base: Array, tool: Array) -> tuple[list[Array], Array]:
-    """Return the origins and tail of the chain for other MDH parameters, base and tool, by the frames of `describe`.
+def corrected(
+    chain: Chain, table: Array, base: Array | None = None, tool: Array | None = None
+) -> tuple[list[Array], Array, float]:
+    """Return the origins and tail of a chain for another MDH table (n, 5), base and tool (6,), and the arm's length.
 
-    With the MDH frame i before Rot(y, beta_i) times G_i as the frame of joint i::
+    With the MDH frame i before Rot(y, beta_i) times G_i as the frame of joint i, as in `describe`::
 
         O_i  = G_i-1^-1 Rot(y, beta_i-1) Rot(x, alpha_i) Trans(x, a_i) Rot(z, theta_i) Trans(z, d_i) G_i
         tail = G_n^-1 Rot(y, beta_n) tool
 
     (O_1 with the base in place of G_0^-1.) What joint i's own zero and place are wrong by moves the frame of link i.
+    By default base and tool are the chain's. The length [m], at least one, is that of the arm stretched out.
     """
-    before = [base, *(np.linalg.inv(g) @ numeric_link(beta=row[4]) for g, row in zip(G, table, strict=True))]
+    _, T_base, T_tool, G = describe(chain)
+    T_base = T_base if base is None else numeric_frame(base)
+    T_tool = T_tool if tool is None else numeric_frame(tool)
+    before = [T_base, *(np.linalg.inv(g) @ numeric_link(beta=row[4]) for g, row in zip(G, table, strict=True))]
     origins = [b @ numeric_link(*row[:4]) @ g for b, row, g in zip(before[:-1], table, G, strict=True)]
-    return origins, before[-1] @ tool
+    ends = sum(float(np.linalg.norm(T[:3, 3])) for T in (T_base, T_tool))
+    return origins, before[-1] @ T_tool, max(float(np.abs(table[:, 1::2]).sum()) + ends, 1.0)
 
 
 def require_same_arm(
@@ -266,13 +273,7 @@ def spliced(data: bytes, edits: dict[tuple[int, int], str]) -> bytes:
     return data
 
 
-def reach(table: Array, *frames: Array) -> float:
-    """Return the length of an arm stretched out [m], at least one, with the frames (4, 4) at its ends."""
-    ends = sum(float(np.linalg.norm(T[:3, 3])) for T in frames)
-    return max(float(np.abs(table[:, 1::2]).sum()) + ends, 1.0)
-
-
-def origin_numbers(T: Array, old: Array, size: float) -> tuple[str | None, str | None]:
+def origin_numbers(T: np.ndarray, old: Array, size: float) -> tuple[str | None, str | None]:
     """Return an origin's new xyz and rpy as texts that read back exactly; None for unchanged ones."""
     six = frame_numbers(T) + 0.0  # no negative zeros
     texts = [" ".join(repr(float(v)) for v in part) for part in (six[:3], six[3:])]

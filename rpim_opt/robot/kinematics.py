@@ -32,22 +32,14 @@ SHARE = 16 * WIDTH  # rows that one thread evaluates before it takes more: enoug
 PAYS = 1_000  # rows from which a vectorized function pays: to build it takes as long as to evaluate twice as many
 
 
-def rotation_x(angle: Symbol) -> ca.SX:
-    """Rot(x, angle)."""
+def rotation(axis: int, angle: Symbol) -> ca.SX:
+    """Rot(x, angle) for axis 0, Rot(y, angle) for 1, Rot(z, angle) for 2."""
     c, s = ca.cos(angle), ca.sin(angle)
-    return _rows([ONE, ZERO, ZERO, ZERO], [ZERO, c, -s, ZERO], [ZERO, s, c, ZERO])
-
-
-def rotation_y(angle: Symbol) -> ca.SX:
-    """Rot(y, angle)."""
-    c, s = ca.cos(angle), ca.sin(angle)
-    return _rows([c, ZERO, s, ZERO], [ZERO, ONE, ZERO, ZERO], [-s, ZERO, c, ZERO])
-
-
-def rotation_z(angle: Symbol) -> ca.SX:
-    """Rot(z, angle)."""
-    c, s = ca.cos(angle), ca.sin(angle)
-    return _rows([c, -s, ZERO, ZERO], [s, c, ZERO, ZERO], [ZERO, ZERO, ONE, ZERO])
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    rows = [[ONE if i == column else ZERO for column in range(4)] for i in range(3)]
+    rows[j][j], rows[j][k] = c, -s
+    rows[k][j], rows[k][k] = s, c
+    return _rows(*rows)
 
 
 def translation(x: Symbol = ZERO, y: Symbol = ZERO, z: Symbol = ZERO) -> ca.SX:
@@ -67,7 +59,7 @@ def product(factors: Sequence[ca.SX]) -> ca.SX:
 
 def link(alpha: Symbol, a: Symbol, theta: Symbol, d: Symbol, beta: Symbol) -> list[ca.SX]:
     """Return the factors Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta), the paper's Eq. (1)."""
-    return [rotation_x(alpha), translation(x=a), rotation_z(theta), translation(z=d), rotation_y(beta)]
+    return [rotation(0, alpha), translation(x=a), rotation(2, theta), translation(z=d), rotation(1, beta)]
 
 
 def numeric_link(alpha: float = 0, a: float = 0, theta: float = 0, d: float = 0, beta: float = 0) -> Array:
@@ -103,8 +95,8 @@ def placed(nominal: Sequence[Symbol], deviation: Sequence[Symbol] = (0,) * 6) ->
     which is regular wherever the nominal frame points: adding to roll, pitch and yaw would be singular at 90 degrees.
     """
     origin = [n + d for n, d in zip(nominal[:3], deviation[:3], strict=True)]
-    turns = [(rotation_z(rz), rotation_y(ry), rotation_x(rx)) for rx, ry, rz in (deviation[3:], nominal[3:])]
-    return [translation(*origin), *turns[0], *turns[1]]
+    turns = [rotation(axis, angles[axis]) for angles in (deviation[3:], nominal[3:]) for axis in (2, 1, 0)]
+    return [translation(*origin), *turns]
 
 
 def numeric_frame(place: Sequence[float] | Array) -> Array:

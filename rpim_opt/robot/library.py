@@ -31,9 +31,12 @@ def robots() -> list[str]:
 
 
 def find_robot(name: str, folder: Path | None = None) -> Path:
-    """Return the file of a robot: one in ``folder``, or a ready robot by name."""
-    if folder is not None and name.endswith(ROBOT_FILES):
-        return inside(folder, name, "key robot", folder / "problem.toml")
+    """Return the file of a robot: any, or one in ``folder``, or a ready robot by name."""
+    if name.endswith(ROBOT_FILES):
+        if folder is not None:
+            return inside(folder, name, "key robot", folder / "problem.toml")
+        require_file(Path(name), endings=ROBOT_FILES)
+        return Path(name)
     ready = robots()
     if name in ready:
         return READY / f"{name}.toml"
@@ -67,11 +70,3 @@ def read_arm(
         accepted = "a table of numbers; other files state their convention"
         raise InputError("--dh", f"'{convention}' of {file.name}", accepted)
     return RobotSetup(read_robot(file))
-
-
-def find_source(robot: str | Path) -> Path:
-    """Return the file of a robot that a command or a script names: of a ready one by name, or a file."""
-    if not str(robot).endswith(ROBOT_FILES):
-        return find_robot(str(robot))
-    require_file(Path(robot), endings=ROBOT_FILES)
-    return Path(robot)

@@ -376,7 +376,14 @@ def model_parameters(
     frames = {"base_": base}
     frames |= {tool_prefix(marker): tool for marker, tool in (tools or {"": (0.0,) * 6}).items()}
     frames |= dict.fromkeys(map(session_prefix, sessions), (0.0,) * 6)
-    entries = _of_joints(robot)
+    entries = []
+    for i, row in enumerate(robot.mdh, start=1):
+        for (column, dimension), value in zip(MDH_DIMENSION.items(), row, strict=True):
+            entries.append(_usual(f"{column}{i}", dimension, value))
+    for i in range(1, len(robot.mdh) + 1):
+        for term in JOINT_TERMS:
+            entries += term.named(i) if i in term.places(robot.joint_types) else []
+    entries += [Entry(name, "angle", BEND_SCALE, 0.0) for name in bend_names(robot)]
     for prefix, place in frames.items():
         for (axis, dimension), value in zip(FRAME_DIMENSION.items(), place, strict=True):
             entries.append(_usual(prefix + axis, dimension, value))
@@ -420,16 +427,3 @@ def _usual(name: str, dimension: str, nominal: float) -> Entry:
     """Return an entry with the usual scale of its group; own dimensions of a measurement have that of their unit."""
     group = "camera" if name.startswith(("camera_", "board_")) else group_of(name, dimension)
     return Entry(name, dimension, DEFAULT_SCALE.get((group, dimension), 1.0), nominal)
-
-
-def _of_joints(robot: Robot) -> list[Entry]:
-    """Return the table's parameters row by row, then what the joints have besides, zero in a nominal robot."""
-    entries = []
-    for i, row in enumerate(robot.mdh, start=1):
-        for (column, dimension), value in zip(MDH_DIMENSION.items(), row, strict=True):
-            entries.append(_usual(f"{column}{i}", dimension, value))
-    for i in range(1, len(robot.mdh) + 1):
-        for term in JOINT_TERMS:
-            if i in term.places(robot.joint_types):
-                entries += term.named(i)
-    return entries + [Entry(name, "angle", BEND_SCALE, 0.0) for name in bend_names(robot)]

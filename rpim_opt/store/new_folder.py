@@ -32,7 +32,7 @@ from rpim_opt.robot.chain import MOUNT, ORIGIN, RobotSetup, RowOrigins, placed, 
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.formats.urdf import branching_tip
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
-from rpim_opt.robot.library import READY, find_source, read_arm
+from rpim_opt.robot.library import READY, find_robot, read_arm
 from rpim_opt.robot.mdh import MDH, MOUNTINGS
 from rpim_opt.robot.parameters import frame_of, model_parameters
 from rpim_opt.store.raw import CLEARLY, Understanding, in_time_order, rows_of, understand_of, usual_noise
@@ -110,7 +110,7 @@ def new_problem(
     (False, 9)
     """
     folder = Path(folder)
-    source = find_source(robot)
+    source = find_robot(str(robot))
     before = _with_chains(folder, source, chain)
     chain = chain or branching_tip(source, urdf_base, urdf_tip)
     if validation and hold_out is not None:

@@ -15,26 +15,16 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
+from rpim_opt.basics.arrays import TINY
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.tables import csv_text, frame_of
 from rpim_opt.basics.text import counted, html_table, listed, markdown, progress_bar, table, three_digits
 from rpim_opt.report.plot import logarithmic
 from rpim_opt.store.instances import Instance
 from rpim_opt.study import studies
-from rpim_opt.study.methods import (
-    FOLDER,
-    METRICS,
-    OK,
-    UNDELIVERED,
-    USUAL,
-    Row,
-    methods_of,
-    metrics_of,
-    problems_of,
-    replicate,
-    splits_of,
-)
+from rpim_opt.study.methods import METRICS, UNDELIVERED, methods_of, metrics_of, problems_of, replicate, splits_of
 
+USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")  # metrics of a comparison that states none
 MOST_DRAWS = 100_000  # each is a calibration of its own, and is listed before the first begins
 LARGEST = float(np.finfo(float).max)  # whole numbers may be larger than any double
 TIE = 0.01  # errors that differ by no more than this part are a tie
@@ -55,7 +45,7 @@ def compare(
     selectors: Any = "learned",
     *,
     methods: Any = (),
-    splits: Any = FOLDER,
+    splits: Any = "folder",
     counts: Any = None,
     noise: Any = 1.0,
     seeds: int | Iterable[int] = 1,
@@ -116,16 +106,16 @@ def compare(
     numbered = _seeds(seeds)
     figured = metrics_of(metrics)
 
-    def work(case: Mapping[str, Any]) -> Callable[[], Row]:  # which takes no more along than it needs
+    def work(case: Mapping[str, Any]) -> studies.Work:  # which takes no more along than it needs
         return partial(replicate, asked[case["problem"]], ways[case["split"]], compared[case["method"]], figured, case)
 
     made = studies.provenance()
     drawn = {label for label, problem in asked.items() if not isinstance(problem, Instance)}
-    cases: list[Row] = []
+    cases: list[studies.Row] = []
     for (label, problem), (split, size), count, factor in product(asked.items(), ways.items(), sizes, factors):
         every = np.inf if callable(problem) else len(np.unique(problem.problem.data.configuration))
         # what a seed changes: what is generated or held out, the noise, which configurations are drawn
-        seeded = callable(problem) or split != FOLDER or factor > 1 or (count is not None and count < every)
+        seeded = callable(problem) or size > 0 or factor > 1 or (count is not None and count < every)
         folds = range(1, max(int(size), 1) + 1)
         for seed, fold, (name, method) in product(numbered if seeded else numbered[:1], folds, compared.items()):
             case = {"problem": label, "method": name, "formulation": method.formulation, "selector": method.selector}
@@ -196,7 +186,7 @@ class Comparison:
     ('README.md', ['README.md', 'comparison.png', 'comparison.svg', 'metrics.json', 'replicates.csv'])
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[studies.Row, ...]
     metrics: tuple[str, ...]
     drawn: frozenset[str] = frozenset()
     asked: Mapping[str, str] = field(default_factory=dict)
@@ -227,9 +217,31 @@ class Comparison:
         The metric is a column of which less is better, by default the first; the reference a method's label, by default
         the first one that has figures. InputError for an unknown metric or method, or where nothing has figures.
         """
-        if metric is not None and metric not in self.metrics:
+        metric = self.metric if metric is None else metric
+        if metric not in self.metrics:
             raise InputError("metric", f"'{metric}'", choices(metric, self.metrics))
-        return summarize(self.rows, metric or self.metric, against, self.drawn)
+        of = figures(self.rows, metric)
+        with_figures = [method for method, values in of.items() if values]
+        if against is None and not with_figures:
+            found = f"no replicate with results; {self.rows[0]['status']}: {self.rows[0]['reason']}"
+            raise InputError("comparison", found, "one")
+        reference = with_figures[0] if against is None else against
+        other = pick(of, reference, "against")
+        if not other:
+            raise InputError("against", f"'{against}', which has no results", "a method with results")
+        standings = []
+        for method in with_figures:
+            own = of[method]
+            count = sum(row["method"] == method for row in self.rows)
+            logs = {pair: _logarithm(own.get(pair)) - _logarithm(other.get(pair)) for pair in own.keys() | other.keys()}
+            wins = sum(log < -TIE for log in logs.values())
+            losses = sum(log > TIE for log in logs.values())
+            ratio = interval({pair: logs[pair] for pair in own if pair in other}, self.drawn)
+            middle = float(np.median(list(own.values())))
+            against_other = (*ratio, wins, len(logs) - wins - losses, losses)
+            standings.append(Standing(method, count, count - len(own), middle, max(own.values()), *against_other))
+        standings.sort(key=lambda each: (each.ratio is None, each.ratio, each.median))
+        return Summary(metric, reference, tuple(standings), tuple(_notes(self.rows, standings, self.drawn, reference)))
 
     def plot(self, metric: str | None = None, against: str | None = None) -> Any:
         """Return a matplotlib figure: every method's errors over the reference's, in pairs.
@@ -282,7 +294,7 @@ class Comparison:
 
     @property
     def _has_figures(self) -> bool:
-        return any(row["status"] in (OK, UNDELIVERED) for row in self.rows)
+        return any(figures(self.rows, self.metric).values())
 
 
 # --- the ranking of methods ------------------------------------------------------------------------------------------
@@ -373,36 +385,9 @@ class Summary:
         return html_table(self.header, self.cells(), self.notes)
 
 
-def summarize(rows: Rows, metric: str, against: str | None, drawn: AbstractSet[str]) -> Summary:
-    """Return `Comparison.summary`; ``drawn`` are problems that depend on a seed."""
-    of = figures(rows, metric)
-    with_figures = [method for method, values in of.items() if values]
-    if against is None and not with_figures:
-        found = f"no replicate with results; {rows[0]['status']}: {rows[0]['reason']}"
-        raise InputError("comparison", found, "one")
-    reference = with_figures[0] if against is None else against
-    other = pick(of, reference, "against")
-    if not other:
-        raise InputError("against", f"'{against}', which has no results", "a method with results")
-
-    def size(figure: float | None) -> float:  # figures that are zero are as good as a rounding error
-        return math.inf if figure is None else math.log(max(figure, np.finfo(float).tiny))
-
-    known = []
-    for method in with_figures:
-        own = of[method]
-        mine = [row for row in rows if row["method"] == method]
-        logs = {pair: size(own.get(pair)) - size(other.get(pair)) for pair in own.keys() | other.keys()}
-        wins = sum(log < -TIE for log in logs.values())
-        losses = sum(log > TIE for log in logs.values())
-        paired = {pair: logs[pair] for pair in own if pair in other}
-        standing = Standing(
-            method, len(mine), len(mine) - len(own), float(np.median(list(own.values()))),
-            max(own.values()), *interval(paired, drawn), wins, len(logs) - wins - losses, losses,
-        )  # fmt: skip
-        known.append(standing)
-    known.sort(key=lambda each: (each.ratio is None, each.ratio, each.median))
-    return Summary(metric, reference, tuple(known), tuple(_notes(rows, known, drawn, reference)))
+def _logarithm(figure: float | None) -> float:
+    """Return the logarithm of a figure, infinite without one; one of zero is as good as a rounding error."""
+    return math.inf if figure is None else math.log(max(figure, TINY))
 
 
 def figures(rows: Rows, metric: str) -> dict[str, dict[Pair, float]]:
@@ -476,7 +461,7 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
     for row in rows:
         if row["status"] == UNDELIVERED:  # each for reasons with figures of its own
             row = {**row, "reason": "their figures are included; the column `reason` states why."}
-        if row["status"] != OK:
+        if row["reason"]:
             without.setdefault((row["method"], row["status"], row["reason"]), []).append(row["problem"])
     for (method, status, reason), missing in without.items():
         where = f" ({listed(list(dict.fromkeys(missing)), 4)})" if len(missing) < every[method] else ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -42,7 +41,6 @@ BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
     **{name: getattr(baselines, name) for name in baselines.__all__},
 }
 """Methods without convex programming; ``nominal`` fits base and tools alone."""
-OK = "ok"
 UNDELIVERED = "not delivered"  # but with figures
 Thing = TypeVar("Thing")
 Problem = Instance | Callable[[int], Any]  # a problem, or a function of a seed with another problem for every seed
@@ -57,12 +55,15 @@ def listed(stated: Any) -> list[tuple[str, Any]]:
     return [("", each) for each in stated]
 
 
-def _by_name(where: str, named: Iterable[tuple[str, Thing]]) -> dict[str, Thing]:
-    pairs = list(named)
-    for name, count in Counter(name for name, _ in pairs).items():
-        if count > 1:
+def _by_name(where: str, named: Iterable[tuple[str, Thing]], accepted: str) -> dict[str, Thing]:
+    known: dict[str, Thing] = {}
+    for name, each in named:
+        if name in known:
             raise InputError(where, f"'{name}' twice", "a unique name for each: {'a name': ...}")
-    return dict(pairs)
+        known[name] = each
+    if not known:
+        raise InputError(where, "none", accepted)
+    return known
 
 
 def _function(label: str, each: Any, ready: Mapping[str, Any], where: str, argument: str) -> tuple[str, Any]:
@@ -83,10 +84,7 @@ def _name(function: Any) -> str:
 
 def problems_of(stated: Any) -> dict[str, Problem]:
     """Return the problems of a comparison by their names; InputError for anything else, and for duplicate names."""
-    problems = _by_name("problems", _problems(stated))
-    if not problems:
-        raise InputError("problems", "none", ACCEPTED)
-    return problems
+    return _by_name("problems", _problems(stated), ACCEPTED)
 
 
 def _problems(stated: Any, label: str = "") -> Iterator[tuple[str, Problem]]:
@@ -147,25 +145,21 @@ def splits_of(stated: Any) -> dict[str, float]:
     return splits
 
 
-def _held_out(data: Dataset, split: float, fold: int, seed: int) -> np.ndarray:
-    """Return which rows (N,) a fraction or a fold (from 1) holds out; all rows of a configuration are, or none."""
-    known = np.unique(data.configuration)
-    drawn = np.random.default_rng(seed).permutation(known)
-    if split < 1:
-        count = min(max(round(split * len(known)), 1), len(known) - 1)
-        return np.isin(data.configuration, drawn[:count])
-    if len(known) < split:
-        raise InputError("splits", f"{len(known)} configurations", f"at least {split} for {split} folds")
-    return np.isin(data.configuration, np.array_split(drawn, int(split))[fold - 1])
-
-
 def _divided(instance: Instance, split: float, case: Mapping[str, Any]) -> tuple[Instance, Dataset]:
-    """Return an instance with the data to fit, and the held-out data; InputError where nothing is held out."""
+    """Return an instance with the data to fit, and the held-out data: all rows of a configuration, or none."""
     seed = case["seed"]
     data = instance.problem.data
     held_out = instance.validation
     if split:
-        held = _held_out(data, split, case["fold"], seed)
+        known = np.unique(data.configuration)
+        if len(known) < split:
+            raise InputError("splits", f"{len(known)} configurations", f"at least {split} for {split} folds")
+        drawn = np.random.default_rng(seed).permutation(known)
+        if split < 1:
+            apart = drawn[: min(max(round(split * len(known)), 1), len(known) - 1)]
+        else:
+            apart = np.array_split(drawn, int(split))[case["fold"] - 1]
+        held = np.isin(data.configuration, apart)
         held_out = data.take(np.flatnonzero(held))
         data = data.take(np.flatnonzero(~held))
     if held_out is None:
@@ -231,9 +225,7 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
     for label, each in listed(functions):
         name, function = _function(label, each, BASELINES, "methods", "the problem")
         methods.append((name, Method(function=function)))
-    if not methods:
-        raise InputError("formulations", "none", f"names ({', '.join(FORMULATIONS)}), objects, or methods")
-    return _by_name("methods", methods)
+    return _by_name("methods", methods, f"formulations ({', '.join(FORMULATIONS)}), or functions of the problem")
 
 
 def _weight(label: str, each: Any) -> tuple[str, dict[str, Any]]:
@@ -338,22 +330,19 @@ METRICS: dict[str, Callable[[Fitted], float | None]] = {
     "covered_percent": _coverage,
     "seconds": lambda fitted: fitted.seconds,
 }
-USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")
 
 
 def metrics_of(stated: Any) -> dict[str, Callable[[Fitted], float | None]]:
     """Return metrics by their names with units; InputError for anything else."""
     metrics = dict(_function(label, each, METRICS, "metrics", "a fit") for label, each in listed(stated))
-    if not metrics:
-        raise InputError("metrics", "none", f"functions of a fit, or {', '.join(METRICS)}")
-    return metrics
+    return _by_name("metrics", metrics.items(), f"functions of a fit, or {', '.join(METRICS)}")
 
 
 def replicate(
     problem: Problem, split: float, method: Method, metrics: Mapping[str, Callable[..., Any]], case: Mapping[str, Any]
 ) -> Row:
     """Return the metrics of a method on one split, None if not finite; a failure becomes a status and a reason."""
-    row: Row = {"status": OK, "reason": "", "configurations": None, "parameters": None, "weight": None}
+    row: Row = {"status": "ok", "reason": "", "configurations": None, "parameters": None, "weight": None}
     try:
         label, seed = case["problem"], case["seed"]
         drawn = _instance(problem if isinstance(problem, Instance) else problem(seed), label)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
 from functools import lru_cache, partial
 from hashlib import file_digest, sha256
-from itertools import product
+from itertools import islice, product
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -44,9 +44,6 @@ class Metric:
     """A metric of a study that must not get worse: its direction, and its relative tolerance.
 
     ``better`` is ``"lower"`` or ``"higher"``, ``tolerance`` what part of the baseline it may be worse by.
-
-    >>> from rpim_opt.study import Metric
-    >>> METRICS = {"mean error [mm]": Metric("lower", 0.1)}  # of a file in the folder studies
     """
 
     better: str
@@ -149,12 +146,10 @@ def files_of(path: Path, study: ModuleType) -> dict[str, str]:
 
 def _matching(folder: Path, pattern: str) -> set[Path]:
     """Return the files that match a pattern, without hidden and compiled ones."""
-    files: set[Path] = set()
-    for match in glob.iglob(str(folder / pattern), recursive=True):
-        files.add(Path(match))
-        if len(files) > MOST_FILES:
-            accepted = "DEPENDS = [...] in the study: names of the files that it reads"
-            raise InputError("DEPENDS", f"more than {MOST_FILES} files in {folder}", accepted)
+    files = [Path(match) for match in islice(glob.iglob(str(folder / pattern), recursive=True), MOST_FILES + 1)]
+    if len(files) > MOST_FILES:
+        accepted = "DEPENDS = [...] in the study: names of the files that it reads"
+        raise InputError("DEPENDS", f"more than {MOST_FILES} files in {folder}", accepted)
     return {file for file in files if file.is_file() and file.suffix != ".pyc"}
 
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.files import LARGEST_TEXT
 from rpim_opt.robot.kinematics import numeric_frame, roll_pitch_yaw
-from rpim_opt.robot.library import find_robot, find_source, read_arm
+from rpim_opt.robot.library import find_robot, read_arm
 from tests.simulate import ARM, simulated
 
 EXACT = 1e-11
@@ -666,7 +666,7 @@ def test_ros_kinematics_in_and_out(tmp_path: Path) -> None:
 def test_a_command_takes_the_drivers_file_as_robot(tmp_path: Path) -> None:
     path = tmp_path / "kinematics.yaml"
     path.write_text(YAML_PLAIN)
-    arm = read_arm(find_source(str(path)))
+    arm = read_arm(find_robot(str(path)))
     assert np.array_equal(arm.robot.mdh, ro.robot.read_ur_kinematics(path).robot.mdh)
 
 

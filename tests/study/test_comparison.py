@@ -190,7 +190,7 @@ def test_noise_that_is_added_is_declared_and_of_the_right_size() -> None:
         ({"selectors": ["reml", ro.reml]}, "'tikhonov, reml' twice"),
         ({"selectors": [lambda _: 1.0, lambda _: 2.0]}, "'tikhonov, <lambda>' twice"),
         ({"selectors": [{"length": 1.0}]}, "a number, a selector"),
-        ({"formulations": (), "selectors": "reml"}, "formulations: found none"),
+        ({"formulations": (), "selectors": "reml"}, "methods: found none"),
         ({"methods": 3}, "methods: found 3"),
         ({"metrics": []}, "metrics: found none"),
         ({"metrics": {"a": 3}}, "metrics: found 3"),

@@ -21,7 +21,6 @@ from rpim_opt.robot.chain import (
     corrected,
     describe,
     origin_numbers,
-    reach,
     require_same_arm,
     spliced,
     without_beta,
@@ -185,12 +184,10 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
     path = Path(source)
     data = read_bytes(path)
     chain, places = _yaml_chain(data)
-    table, base, tool, G = describe(chain)
-    notes = require_same_arm(robot, table, REVOLUTE, path)
-    origins, _ = corrected(G, robot.mdh, base, tool)
+    notes = require_same_arm(robot, describe(chain)[0], REVOLUTE, path)
     if robot.mdh[-1, 4]:
         raise InputError("robot", "beta6, which follows the last joint", "a robot with beta6 = 0")
-    size = reach(robot.mdh, base, tool)
+    origins, _, size = corrected(chain, robot.mdh)
     edits = {}
     for name, T, old in zip(JOINTS, origins, chain.origins, strict=True):
         texts = origin_numbers(T, old, size)

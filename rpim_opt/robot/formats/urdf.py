@@ -36,7 +36,6 @@ from rpim_opt.robot.chain import (
     describe,
     origin_numbers,
     origins_term,
-    reach,
     require_same_arm,
     spliced,
 )
@@ -144,7 +143,7 @@ def write_urdf(
     """
     urdf = _read(Path(source))
     way = urdf.way(base, tip)
-    table, T_base, T_tool, G = describe(way.chain)
+    table = describe(way.chain)[0]
     edits: dict[tuple[int, int], str] = {}
     followers = urdf.followers()
     for joint, old, new in zip(way.joints, way.joint_map, robot.joint_map, strict=False):
@@ -153,10 +152,7 @@ def write_urdf(
             edits |= joint.edits(urdf.data, "mimic", {"multiplier": repr(float(old.sum()))})
     kinds = tuple(joint.kind for joint in way.joints)
     notes = require_same_arm(robot, table + way.offsets, kinds, Path(source), way.joint_map)
-    T_base = T_base if base_frame is None else numeric_frame(base_frame)
-    T_tool = T_tool if tool_frame is None else numeric_frame(tool_frame)
-    origins, tail = corrected(G, robot.mdh - way.offsets, T_base, T_tool)
-    size = reach(robot.mdh, T_base, T_tool)
+    origins, tail, size = corrected(way.chain, robot.mdh - way.offsets, base_frame, tool_frame)
     before = [*way.chain.origins, way.chain.tail]
     for between, old, new in zip(way.parts, before, [*origins, tail], strict=True):
         if between:  # one origin takes the whole correction
@@ -164,8 +160,8 @@ def write_urdf(
             step = between[taker]
             left = _product([each.constant for each in between[:taker]])
             right = _product([each.constant for each in between[taker + 1 :]])
-            T = _inverse(left) @ new @ _inverse(right)
-            edits |= step.joint.origin_edits(urdf.data, _inverse(T) if step.up else T, size)
+            T = np.linalg.inv(left) @ new @ np.linalg.inv(right)
+            edits |= step.joint.origin_edits(urdf.data, np.linalg.inv(T) if step.up else T, size)
         elif np.abs(new - old).max() > 10 * ROUNDING * size:
             at_tip = new is tail
             step = way.steps[-1 if at_tip else 0]
@@ -205,7 +201,7 @@ class _Step(NamedTuple):
     up: bool
     start: str
     end: str
-    constant: Array  # transform (4, 4) of its origin: before its motion, or after it where it is passed up
+    constant: np.ndarray  # transform (4, 4) of its origin: before its motion, or after it where it is passed up
 
 
 class _Way(NamedTuple):
@@ -241,11 +237,7 @@ def _displacements(way: _Way, table: Array, G: Array) -> list[Term]:
     return terms
 
 
-def _inverse(T: Array) -> Array:
-    return np.asarray(np.linalg.inv(T), dtype=float)
-
-
-def _product(transforms: Sequence[Array]) -> Array:
+def _product(transforms: Sequence[np.ndarray]) -> Array:
     return functools.reduce(np.matmul, transforms, np.eye(4))
 
 
@@ -352,28 +344,25 @@ class _Joint:
         unlimited = far or lower == upper or self.element.get("type") == "continuous"
         return (-math.inf, math.inf) if unlimited else (lower, upper)
 
-    def origin_edits(self, data: bytes, T: Array, size: float) -> dict[tuple[int, int], str]:
+    def origin_edits(self, data: bytes, T: np.ndarray, size: float) -> dict[tuple[int, int], str]:
         """Return what to replace in the file so that the origin becomes T, by first and last byte."""
         texts = zip(("xyz", "rpy"), origin_numbers(T, self.origin, size), strict=True)
         return self.edits(data, "origin", {name: text for name, text in texts if text is not None})
 
     def edits(self, data: bytes, tag: str, new: dict[str, str]) -> dict[tuple[int, int], str]:
         """Return what to replace in the file so that an element has these attributes; it is put in where it is not."""
-        if not new:
-            return {}
         element = self._only(tag)
         start = self.element.start if element is None else element.start
         end = next(TAG.finditer(data, start)).end()
-        if element is None:
-            return {(end, end): f"<{tag}{_attributes(new)}/>"}
         edits = {}
-        for match in ATTRIBUTE.finditer(data, start, end):
+        for match in () if element is None else ATTRIBUTE.finditer(data, start, end):
             text = new.pop(match[1].decode(errors="replace"), None)
             if text is not None:
                 edits[match.start(2) + 1, match.end(2) - 1] = text
         if new:
-            after_name = start + len(f"<{tag}")
-            edits[after_name, after_name] = _attributes(new)
+            place = end if element is None else start + len(f"<{tag}")
+            attributes = "".join(f' {name}="{value}"' for name, value in new.items())
+            edits[place, place] = f"<{tag}{attributes}/>" if element is None else attributes
         return edits
 
 
@@ -383,10 +372,6 @@ def _numbers(text: str, count: int, largest: float = LARGEST_NUMBER) -> Array | 
     if len(numbers) != count or not (np.abs(numbers) < largest).all():
         return None
     return numbers
-
-
-def _attributes(values: Mapping[str, str]) -> str:
-    return "".join(f' {name}="{value}"' for name, value in values.items())
 
 
 @dataclass(frozen=True, eq=False)
@@ -435,7 +420,7 @@ class _Urdf:
             down.pop()
         if (up[-1].parent if up else base) != (down[-1].parent if down else tip):
             raise InputError(f"link '{tip}'", f"no chain from '{base}' to it", "links of one tree")
-        upwards = [_Step(joint, True, joint.child, joint.parent, _inverse(joint.origin)) for joint in up]
+        upwards = [_Step(joint, True, joint.child, joint.parent, np.linalg.inv(joint.origin)) for joint in up]
         return upwards + [_Step(joint, False, joint.parent, joint.child, joint.origin) for joint in reversed(down)]
 
     def way(self, base: str | None, tip: str | None) -> _Way:
