@@ -74,13 +74,10 @@ def inside(folder: Path, name: str, where: str, file: object = None) -> Path:
     path = folder / name
     accepted = "the name of a file in the folder"
     try:
-        home = Path(os.path.realpath(folder))
-        place = Path(os.path.realpath(path))
-        parts = Path(name).parts
-        lies_in = place != home and place.is_relative_to(home)
+        home, place = (Path(os.path.realpath(each)) for each in (folder, path))
     except (OSError, ValueError) as error:
         raise InputError(where, str(error), accepted, file) from None
-    if not parts or ".." in parts or Path(name).is_absolute() or not lies_in:
+    if ".." in path.parts[len(folder.parts) :] or Path(name).is_absolute() or home not in place.parents:
         raise InputError(where, f"{name!r}", accepted, file)
     return path
 
@@ -205,10 +202,9 @@ def _remove_empty(folder: Path) -> None:
 
 def _keep_mode(handle: int, place: Path) -> None:
     """Give a new file the mode and the owner of the file that it replaces."""
-    try:
-        known = place.stat()
-    except OSError:
+    if not place.exists():
         return
+    known = place.stat()
     if not os.access(place, os.W_OK):
         raise PermissionError(13, "the existing file is write-protected", str(place))
     if hasattr(os, "fchown"):

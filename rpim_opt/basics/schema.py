@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_core import ErrorDetails
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.units import UNITS, quantities, split_unit
+from rpim_opt.basics.units import DIMENSIONS, quantities, split_unit
 
 Length = Annotated[float, "length"]
 Angle = Annotated[float, "angle"]
@@ -39,8 +39,8 @@ class Table(BaseModel):
         """Return a table with its quantities in SI; every quantity may occur once, in any unit."""
         if not isinstance(table, dict):
             return table
-        every = {unit.dimension for unit in UNITS.values()}
-        of_fields = {name: tuple(m for m in field.metadata if m in every) for name, field in cls.model_fields.items()}
+        fields = cls.model_fields.items()
+        of_fields = {name: tuple(each for each in field.metadata if each in DIMENSIONS) for name, field in fields}
         dimensions = {name: known for name, known in of_fields.items() if known}
         plain = [field.alias or name for name, field in cls.model_fields.items() if name not in dimensions]
         others = {key: value for key, value in table.items() if key not in plain}

@@ -24,7 +24,7 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 import scipy
 
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import LARGEST_DATA, read_bytes, read_text, require_file
 from rpim_opt.basics.units import numeral
 
@@ -368,12 +368,8 @@ def _excel(path: Path, sheet: str) -> Grid:
                 raise InputError("the file", f"{size} bytes unpacked", accepted)
             book = openpyxl.load_workbook(stream, read_only=True, data_only=True)
             names = [each.title for each in book.worksheets]
-            wanted = [sheet] if sheet else names
-            if sheet and sheet not in names:
-                number = int(sheet) if sheet.isdigit() else 0
-                if not 0 < number <= len(names):
-                    raise InputError("--sheet", f"'{sheet}'", choices(sheet, names))
-                wanted = [names[number - 1]]
+            known = {str(i): name for i, name in enumerate(names, start=1)} | {name: name for name in names}
+            wanted = [pick(known, sheet, "--sheet")] if sheet else names
             for named in wanted:
                 filled = list(_filled(book[named]))
                 numeric = any(sum(map(is_numeral, row)) >= NUMBERS_OF_ROW for _, row in filled)
@@ -485,8 +481,7 @@ def _with_apostrophe(cell: Any) -> Any:
 
 def frame_of(rows: Sequence[dict[str, Any]]) -> Any:
     """Return rows as a pandas data frame, or polars if pandas is not installed."""
-    with contextlib.suppress(ImportError):
-        return import_module("pandas").DataFrame(list(rows))
-    with contextlib.suppress(ImportError):
-        return import_module("polars").DataFrame(list(rows), infer_schema_length=None)
+    for name, options in (("pandas", {}), ("polars", {"infer_schema_length": None})):
+        with contextlib.suppress(ImportError):
+            return import_module(name).DataFrame(list(rows), **options)
     raise InputError("the data frame", "neither pandas nor polars", "pip install 'rpim-opt[studies]'")

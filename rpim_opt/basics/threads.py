@@ -7,7 +7,6 @@ import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ContextDecorator
-from functools import lru_cache
 from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
@@ -34,22 +33,19 @@ def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> l
         return list(pool.map(function, waiting))
 
 
-@lru_cache(maxsize=1)
-def _controller() -> ThreadpoolController:
-    import scipy.linalg  # noqa: F401 - its BLAS must be loaded to be found
-
-    return ThreadpoolController()
-
-
 class _OneThread(ContextDecorator):
     lock = threading.Lock()
     inside = 0
+    controller: ThreadpoolController | None = None
     limit: Any = None
 
     def __enter__(self) -> None:
         with self.lock:
             if not self.inside:
-                self.limit = _controller().limit(limits=1, user_api="blas")
+                import scipy.linalg  # noqa: F401 - its BLAS must be loaded to be found
+
+                self.controller = self.controller or ThreadpoolController()
+                self.limit = self.controller.limit(limits=1, user_api="blas")
             self.inside += 1
 
     def __exit__(self, *error: object) -> None:

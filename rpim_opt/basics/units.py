@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from fnmatch import fnmatchcase
-from functools import cache
 from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError, choices
@@ -21,7 +20,7 @@ class Unit(NamedTuple):
     zero: float = 0.0
 
 
-_BY_DIMENSION = {
+DIMENSIONS = {
     "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "cm": 1e-2, "in": 0.0254},
     "length2": {"m2": 1.0, "mm2": 1e-6, "um2": 1e-12},
     "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "gon": math.pi / 200},
@@ -39,9 +38,10 @@ _BY_DIMENSION = {
     "pixel2": {"px2": 1.0},
     "length per force": {"m_per_N": 1.0, "mm_per_N": 1e-3, "um_per_N": 1e-6},
 }
+"""Sizes of units in SI by dimension."""
 UNITS = {
     name: Unit(dimension, si, 273.15 if name == "degC" else 0.0)
-    for dimension, units in _BY_DIMENSION.items()
+    for dimension, units in DIMENSIONS.items()
     for name, si in units.items()
 }
 
@@ -63,10 +63,9 @@ WITH_UNIT = re.compile(rf"_({'|'.join(sorted(UNITS, key=len, reverse=True))})\Z"
 LONGEST = 200  # characters of a pattern or a name: longer ones would take too long to match
 
 
-@cache
 def accepted_units(dimension: str) -> tuple[str, ...]:
     """Return the unit suffixes of a dimension."""
-    return tuple(name for name, unit in UNITS.items() if unit.dimension == dimension)
+    return tuple(DIMENSIONS.get(dimension, ()))
 
 
 def display(dimension: str) -> tuple[str, float]:

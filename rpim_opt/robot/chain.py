@@ -67,9 +67,7 @@ def same_place(one: Array, other: Array) -> bool:
 def placed(place: Array) -> str:
     """Return a frame (6,) as text, to a micrometre 6 m away."""
     values = [f"{value:z.3f}" for value in 1e3 * place[:3]] + [f"{value:z.5f}" for value in np.degrees(place[3:])]
-    return (
-        " ".join(f"{name} {value}" for name, value in zip(FRAME, values, strict=True)) + " mm, deg (roll, pitch, yaw)"
-    )
+    return f"{' '.join(map(' '.join, zip(FRAME, values, strict=True)))} mm, deg (roll, pitch, yaw)"
 
 
 def describe(

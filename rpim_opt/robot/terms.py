@@ -265,11 +265,9 @@ def term_motion(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.
     return ca.vec(moves)
 
 
-def _require_still(term: Term, moves: ca.SX, symbols: Sequence[ca.SX]) -> None:
+def _require_still(term: Term, moves: ca.SX, symbols: ca.SX) -> None:
     """Refuse a term that moves with all its parameters zero, of which ``symbols`` are the symbols."""
-    if not symbols:
-        return
-    still = ca.substitute(moves, ca.vertcat(*symbols), ca.SX.zeros(len(symbols)))
+    still = ca.substitute(moves, symbols, ca.SX.zeros(symbols.numel()))
     seen = ca.symvar(still)
     left = float(ca.norm_inf(ca.Function("still", seen, [still]).call([ca.DM(SOMEWHERE)] * len(seen))[0]))
     if left > ROUNDING:
@@ -410,11 +408,12 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
             for i in term.places(joint_types):
                 names = term.names(i)
                 if not names or any(map(used, names)):
-                    symbols = dict(zip(names, ca.vertsplit(ca.SX.sym("symbols", len(names))), strict=True))
-                    more = term_motion(term, Joint(i, configuration), symbols.__getitem__)
-                    if more is not None:
-                        _require_still(term, more, [*symbols.values()])
-                        moves = ca.vertcat(moves, more)
+                    symbols = ca.SX.sym("symbols", len(names))
+                    value = dict(zip(names, ca.vertsplit(symbols), strict=True)).__getitem__
+                    more = term_motion(term, Joint(i, configuration), value)
+                    if more is not None and names:
+                        _require_still(term, more, symbols)
+                    moves = ca.vertcat(moves, ca.SX(0, 1) if more is None else more)
         return Dependencies(
             torques=ca.depends_on(moves, torque),
             gravity=ca.depends_on(moves, gravity.payload),

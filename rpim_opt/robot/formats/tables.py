@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +28,7 @@ READY = Path(__file__).resolve().parents[1] / "ready"
 SHEETS = (".csv", ".tsv", ".txt", ".md", ".xlsx")  # endings of tables with one row per joint
 WRITTEN = (".toml", ".json", ".csv")  # endings of what is written
 LIMITS = ("lower", "upper")
+CENTRE = ("centre_x", "centre_y", "centre_z")
 SI = {"angle": "rad", "length": "m"}
 FAR = 10.0  # a common normal that is further away [m] is that of nearly parallel axes
 CONVENTIONS = {"modified": "modified", "craig": "modified", "proximal": "modified", "mdh": "modified",
@@ -365,25 +366,19 @@ def _content(robot: Robot) -> dict[str, Any]:
         words = {direction: word for word, direction in MOUNTINGS.items()}
         content["mounting"] = words.get(gravity.direction, list(gravity.direction))
     if gravity.payload or any(gravity.payload_centre):
-        content["payload"] = {"mass_kg": gravity.payload}
-        for axis, value in zip("xyz", gravity.payload_centre, strict=True):
-            content["payload"] |= _quantity(axis, "length", value)
+        content["payload"] = {"mass_kg": gravity.payload} | _quantities("xyz", gravity.payload_centre)
     in_si = _in_si(robot)
     limits = dict(zip(robot.leading, robot.limits, strict=True))
     content["joint"] = []
-    for i, (numbers, kind) in enumerate(zip(robot.mdh, robot.joint_types, strict=True)):
-        joint: dict[str, Any] = {}
-        for (column, dimension), value in zip(MDH_DIMENSION.items(), numbers, strict=True):
-            joint |= _quantity(column, dimension, value, in_si)
+    for i, kind in enumerate(robot.joint_types):
+        joint: dict[str, Any] = _quantities(MDH, robot.mdh[i], in_si)
         if kind != "revolute":
             joint["type"] = kind
         if i in limits and np.isfinite(limits[i]).any():
             unit, pair = exact("angle" if kind == "revolute" else "length", limits[i], in_si)
             joint[f"limits_{unit}"] = pair
         if gravity.masses:
-            joint["mass_kg"] = gravity.masses[i]
-            for axis, value in zip("xyz", gravity.centres[i], strict=True):
-                joint |= _quantity(f"centre_{axis}", "length", value, in_si)
+            joint |= {"mass_kg": gravity.masses[i]} | _quantities(CENTRE, gravity.centres[i], in_si)
         if plain and signs[i] < 0:
             joint["sign"] = -1
         content["joint"].append(joint)
@@ -396,12 +391,11 @@ def _in_si(robot: Robot) -> bool:
     return any(exact(MDH_DIMENSION[column], values)[0] == SI[MDH_DIMENSION[column]] for column, values in columns)
 
 
-def _quantity(stem: str, dimension: str, value: float, in_si: bool = False) -> dict[str, float]:
-    """Return a quantity under its name with the unit; nothing for zero."""
-    if not value:
-        return {}
-    unit, (number,) = exact(dimension, [value], in_si)
-    return {f"{stem}_{unit}": number}
+def _quantities(stems: Iterable[str], values: Iterable[float], in_si: bool = False) -> dict[str, float]:
+    """Return quantities that are not zero under their names with the unit: lengths but for the table's angles."""
+    pairs = zip(stems, values, strict=True)
+    written = {stem: exact(MDH_DIMENSION.get(stem, "length"), [value], in_si) for stem, value in pairs if value}
+    return {f"{stem}_{unit}": number for stem, (unit, (number,)) in written.items()}
 
 
 def exact(dimension: str, values: Any, in_si: bool = False) -> tuple[str, list[float]]:
