@@ -697,7 +697,7 @@ def compare(
 
     With --out every replicate is stored when it is finished, and README.md with the figure at the end.
     """
-    from rpim_opt.study.methods import USUAL
+    from rpim_opt.study.comparison import USUAL
 
     journal = None if out is None else out / "replicates.jsonl"
     words, numbers = console.listed_words, console.listed_numbers

@@ -233,9 +233,11 @@ def _decimal(angle: re.Match[str]) -> str:
 def decoded(path: Path, encoding: str = "") -> tuple[str, tuple[str, ...]]:
     """Return the decoded text of a file, and a note on its encoding unless it is UTF-8."""
     binary = InputError("the text", "bytes that are zero", "a text file, not a binary one")
+    with path.open("rb") as stream:  # before it is in memory: a file may be one long hole
+        while block := stream.read(2**20):
+            if ZEROS in block:
+                raise binary
     data = read_bytes(path, LARGEST_DATA)
-    if ZEROS in data:
-        raise binary
     name, why = (encoding, "as requested") if encoding else _encoding(data)
     try:
         text = data.decode(name)
@@ -475,8 +477,12 @@ def columns_csv(columns: Mapping[str, Sequence[Any]], exact: Iterable[str] = ())
 
 def _with_apostrophe(cell: Any) -> Any:
     """Return a cell that no spreadsheet takes for a formula; numbers may have a sign."""
-    formula = isinstance(cell, str) and FORMULA.match(cell) and math.isnan(numeral(cell))
-    return f"'{cell}" if formula else cell
+    if not isinstance(cell, str) or not FORMULA.match(cell):
+        return cell
+    with contextlib.suppress(ValueError):
+        float(cell)
+        return cell
+    return f"'{cell}"
 
 
 def frame_of(rows: Sequence[dict[str, Any]]) -> Any:
