@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -47,6 +47,7 @@ DIVERGES_PENALIZED = (
     "combinations that neither the data nor the penalty determine diverge; use a larger weight, or penalize all "
     "parameters."
 )
+DISPLACED = "Deviations refer to registered frames"
 ZERO = 0.1  # standard deviation [rad] of a joint's zero that was found from the data
 
 
@@ -142,7 +143,7 @@ def calibrate(
     require_affordable(problem)
     require_finite(*(block.y for block in problem.sample().data.blocks))
     mapping: JointMapping | None = None
-    notes: list[str] = []
+    stated: Source | None = None
     if start is not None:
         start = require_start(start, len(problem.parameters.free))
     else:
@@ -150,7 +151,7 @@ def calibrate(
             mapping, problem = found
             prior = (prior or Prior()) & _wide_zeros(mapping)
         if (elsewhere := relocated(problem)) is not None:
-            notes, problem = _displaced_frames(problem, elsewhere), elsewhere
+            stated, problem = problem, elsewhere
     again: Callable[..., Calibration] = partial(
         calibrate,
         formulation=formulation,
@@ -179,8 +180,7 @@ def calibrate(
             formulation = prior.stated(problem.parameters, widened=False).penalized(formulation)
     ended = minimize(problem, formulation, weight, start, options)
     choice = ended.state.choice
-    notes += [mapping.sentence] if mapping else []
-    message = " ".join([ending(ended, max_iterations), *notes])
+    message = _with_notes(ending(ended, max_iterations), stated, problem, mapping)
     LOGGER.info(message)
     return Calibration(
         problem=problem,
@@ -193,7 +193,7 @@ def calibrate(
         history=ended.state.history,
         program=ended.state.program,
         certificate=ended.certificate,
-        calibrate_again=mapped_as(mapping, again, notes),
+        calibrate_again=mapped_as(mapping, again, stated),
         learned=learned,
         mapping=mapping,
         excluded=excluded,
@@ -252,34 +252,41 @@ def ending(ended: Ended, most: int) -> str:
     return " ".join(filter(None, [f"Not converged: {why}", state.choice.note]))
 
 
-def _displaced_frames(stated: Source, registered: Source) -> list[str]:
+def _with_notes(message: str, stated: Source | None, registered: Source, mapping: JointMapping | None) -> str:
+    """Return a message with sentences on stated frames far from their registration, and on joints that were mapped."""
+    apart = stated and _displaced_frames(stated, registered)
+    return " ".join(filter(None, [message, apart, mapping and mapping.sentence]))
+
+
+def _displaced_frames(stated: Source, registered: Source) -> str:
     """Return a sentence on stated frames far from their registration; one at the origin was not stated."""
-    p, q = stated.parameters, registered.parameters
+    p, q = (dict(zip(s.parameters.names, s.parameters.nominal.tolist(), strict=True)) for s in (stated, registered))
     far = []
-    for prefix in (name[:-1] for name in p.names if name.endswith("_x") and f"{name[:-1]}z" in p.names):
-        at = [p.names.index(prefix + axis) for axis in "xyz"]
-        apart = 1e3 * float(np.linalg.norm(q.nominal[at] - p.nominal[at]))
-        if apart > 0 and p.nominal[at].any():
-            where = ", ".join(f"{1e3 * value:.0f}" for value in q.nominal[at])
+    for prefix in (name[:-1] for name in p if name.endswith("_x") and f"{name[:-1]}z" in p):
+        was, now = (np.array([nominal[prefix + axis] for axis in "xyz"]) for nominal in (p, q))
+        apart = 1e3 * float(np.linalg.norm(now - was))
+        if apart > 0 and was.any():
+            where = ", ".join(f"{1e3 * value:.0f}" for value in now)
             far.append(f"{prefix[:-1]} by {apart:.0f} mm (registered at {where} mm)")
     if not far:
-        return []
-    return [
-        f"Deviations refer to registered frames, far from the stated ones: {joined(far)}. The flange frame is "
-        "that of the DH table after the last joint; that of a data sheet may be rotated."
-    ]
+        return ""
+    return (
+        f"{DISPLACED}, far from the stated ones: {joined(far)}. The flange frame is that of the DH table after the "
+        "last joint; that of a data sheet may be rotated."
+    )
 
 
 def mapped_as(
-    mapping: JointMapping | None, again: Callable[..., Calibration], notes: Sequence[str] = ()
+    mapping: JointMapping | None, again: Callable[..., Calibration], stated: Source | None = None
 ) -> Callable[..., Calibration]:
-    """Return a calibration of problems with estimated joint mappings or registered frames, with notes on them."""
+    """Return a calibration of problems with estimated joint mappings or registered frames, which its message names."""
 
     def mapped(problem: Source, **other: Any) -> Calibration:
         result = again(problem, **other)
-        return replace(result, mapping=mapping, message=" ".join([result.message, *notes]))
+        ended = result.message.partition(f" {DISPLACED}")[0]  # frames are registered again, but were stated once
+        return replace(result, mapping=mapping, message=_with_notes(ended, stated, result.problem, mapping))
 
-    return mapped if mapping or notes else again
+    return mapped if mapping or stated else again
 
 
 def _logged(progress: Callable[[Iteration], None] | None) -> Callable[[Iteration], None]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -173,3 +175,23 @@ def test_a_calibration_prints_itself() -> None:
     text = str(instance.calibrate())
     for expected in ("deviation", "d5", "deg", "mm after", "corner of the L-curve", "Converged"):
         assert expected in text
+
+
+def test_a_calibration_of_more_rows_says_once_how_far_frames_are_from_the_stated_ones() -> None:
+    """Registered again, with gross rows that move the registration: how far is from what was stated, not from there."""
+    instance = ro.load("position")
+    p = instance.problem.parameters
+    nominal = p.nominal.copy()
+    nominal[p.names.index("base_x")] += 1.0
+    first = ro.calibrate(instance.problem.with_parameters(replace(p, nominal=nominal)))
+    block = instance.problem.data.blocks[0]
+    gross = block.y.copy()
+    gross[:3] += 2.0
+    rows = replace(instance.problem.data, blocks=(replace(block, y=gross),))
+    for result in (first, first.calibrate_again(first.stated.on(rows))):
+        q = result.problem.parameters.nominal
+        apart = np.linalg.norm(
+            [q[p.names.index(n)] - nominal[p.names.index(n)] for n in ("base_x", "base_y", "base_z")]
+        )
+        assert result.message.count("far from the stated ones") == 1
+        assert f"base by {1e3 * apart:.0f} mm" in result.message
