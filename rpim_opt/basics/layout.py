@@ -282,19 +282,12 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
     ]
     higher = [next(filter(None, cells), "") for cells in zip(*reversed(grouping), names, strict=True)]
     names = [top if alone else name for top, name, alone in zip(higher, names, downwards, strict=True)]
-    groups = [_merged(row, downwards) for row in grouping]
-    heads = zip(names, units, *groups, strict=True)
-    return [(_with_unit(name, unit), " ".join(filter(None, above_it))) for name, unit, *above_it in heads], above
-
-
-def _merged(row: Sequence[str], downwards: Sequence[bool]) -> list[str]:
-    """Return the groups of a line of the header: a cell also counts for blank ones to its right."""
-    group = ""
-    groups = []
-    for cell, alone in zip(row, downwards, strict=True):
-        group = "" if alone else cell or group
-        groups.append(group)
-    return groups
+    heads = []
+    groups = [""] * len(grouping)  # a cell also counts for blank ones to its right
+    for name, unit, alone, *cells in zip(names, units, downwards, *grouping, strict=True):
+        groups = ["" if alone else cell or group for cell, group in zip(cells, groups, strict=True)]
+        heads.append((_with_unit(name, unit), " ".join(filter(None, groups))))
+    return heads, above
 
 
 def _with_unit(name: str, unit: str) -> str:
@@ -475,7 +468,8 @@ def _one_row_each(table: RawTable) -> RawTable:
     if not points:
         accepted = f"a column that names the point, with {', '.join(parts)} once for each point"
         raise InputError("the header", f"one row per coordinate ('{axis}')", accepted)
-    columns = _of_points(texts, points)
+    every = {name: [{cells[i] for i in rows.values()} for rows in points] for name, cells in texts.items()}
+    columns = {name: [min(own) for own in each] for name, each in every.items() if max(map(len, each)) == 1}
     value = _value_column({name: cells for name, cells in texts.items() if name not in columns})
     units = [cells for cells in texts.values() if {cell.lower() for cell in cells} <= UNIT_SIGNS]
     for part in parts:
@@ -484,12 +478,6 @@ def _one_row_each(table: RawTable) -> RawTable:
         columns[_with_unit(part, unit)] = [texts[value][rows[part]] if part in rows else "" for rows in points]
     note = f"one row per coordinate: column '{value}' by '{axis}'."
     return replace(table, columns=columns, notes=(*table.notes, note))
-
-
-def _of_points(texts: Mapping[str, list[str]], points: Sequence[Mapping[str, int]]) -> dict[str, list[str]]:
-    """Return the columns that hold one text for all rows of a point, with one cell for each point."""
-    every = {name: [{cells[i] for i in rows.values()} for rows in points] for name, cells in texts.items()}
-    return {name: [min(own) for own in each] for name, each in every.items() if max(map(len, each)) == 1}
 
 
 def _names_parts(cells: Sequence[Any]) -> bool:

@@ -420,21 +420,16 @@ def _first_line(error: Exception) -> str:
 
 def numbers(cells: Sequence[Any], column: str, labels: Sequence[str] = ()) -> np.ndarray:
     """Return cells as finite numbers (N,); InputError names the first invalid row."""
-    try:
+    with contextlib.suppress(TypeError, ValueError):
         values = np.asarray(cells)
         if values.dtype.kind in "iuf" and np.isfinite(values).all():
             return values.astype(float)
-    except (TypeError, ValueError):
-        pass
-    converted = []
-    for i, cell in enumerate(cells):
-        text = "" if cell is None else str(cell).strip()
-        value = math.nan if isinstance(cell, bool | np.bool_) else numeral(text)
-        if math.isnan(value):
-            row = labels[i] if labels else i + 1
-            raise InputError(f"row {row}, column {column}", f"'{text[:40]}'", "a finite number")
-        converted.append(value)
-    return np.array(converted)
+    shown = ["" if cell is None else str(cell).strip() for cell in cells]
+    values = np.array([numeral(text) for text in shown])
+    for i in np.flatnonzero(np.isnan(values)):
+        row = labels[i] if labels else i + 1
+        raise InputError(f"row {row}, column {column}", f"'{shown[i][:40]}'", "a finite number")
+    return values
 
 
 def texts(cells: Sequence[Any], column: str) -> tuple[str, ...]:

@@ -103,7 +103,11 @@ def compare(
     ways = splits_of(splits)
     sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1, int)
     factors = _numbers("noise", noise, "factors of 1 or more on the noise that was measured", 1, float)
-    numbered = _seeds(seeds)
+    if isinstance(seeds, int | np.integer) and not isinstance(seeds, bool):
+        if seeds > MOST_DRAWS:
+            raise InputError("seeds", f"{seeds}", f"at most {MOST_DRAWS} draws")
+        seeds = range(max(int(seeds), 0))
+    numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0, int)
     figured = metrics_of(metrics)
 
     def work(case: Mapping[str, Any]) -> studies.Work:  # which takes no more along than it needs
@@ -142,15 +146,6 @@ def compare(
     }
     settings = {name: "; ".join(values) for name, values in axes.items() if values}
     return Comparison(tuple(rows), tuple(figured), frozenset(drawn), settings, made)
-
-
-def _seeds(stated: int | Iterable[int]) -> list[int]:
-    """Return seeds that are stated one by one, or by how many there are."""
-    if isinstance(stated, int | np.integer) and not isinstance(stated, bool):
-        if stated > MOST_DRAWS:
-            raise InputError("seeds", f"{stated}", f"at most {MOST_DRAWS} draws")
-        stated = range(max(int(stated), 0))
-    return _numbers("seeds", stated, "whole numbers, 0 or more", 0, int)
 
 
 def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:
@@ -482,20 +477,23 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     >>> len(figure.axes)
     1
     """
-    ax = _axes(0.32 * len(values) + 0.9)
+    ax = _axes(list(values), label, 0.32 * len(values) + 0.9)
     for y, known in enumerate(values.values()):
         dots = ax.plot(known, [y] * len(known), "o", ms=3, alpha=min(1.0, 5 / len(known) ** 0.5), color="C0", mew=0)
         dots[0].set_rasterized(len(known) > 50)  # thousands of dots would make megabytes of SVG
         middle = sorted(known)[len(known) // 2]
         ax.plot([middle], [y], "|", ms=11, mew=2, color="C3")
         ax.annotate(f"{middle:.3g}", (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=8)
-    return _finished(ax, list(values), label)
+    logarithmic(ax, "x")
+    return ax.figure
 
 
 def _ratios(summary: Summary, of: Mapping[str, Mapping[Pair, float]]) -> Any:
     """Return the figure: methods from top to bottom, their ratios as dots, the mean with the ends of its interval."""
     other = of[summary.reference]
-    ax = _axes(max(ROW_INCHES * len(summary.standings) + 1.5, 3.5), dpi=150)
+    label = f"{summary.metric} over that of {summary.reference}, same replicate"
+    names = [each.method for each in summary.standings]
+    ax = _axes(names, label, max(ROW_INCHES * len(names) + 1.5, 3.5), dpi=150)
     ax.axvline(1, color="0.4", lw=1, zorder=1)
     for y, each in enumerate(summary.standings):
         values = [own / other[pair] for pair, own in of[each.method].items() if other.get(pair)]
@@ -512,25 +510,21 @@ def _ratios(summary: Summary, of: Mapping[str, Mapping[Pair, float]]) -> Any:
         if each.ratio is not None:
             ax.plot(_inside([each.ratio]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
     ax.set_title("dots: replicates; marks: geometric mean, 95 % interval", fontsize=9)
-    label = f"{summary.metric} over that of {summary.reference}, same replicate"
-    return _finished(ax, [each.method for each in summary.standings], label)
+    logarithmic(ax, "x")
+    return ax.figure
 
 
-def _axes(height: float, **options: Any) -> Any:
+def _axes(names: Sequence[str], label: str, height: float, **options: Any) -> Any:
+    """Return the axes of a new figure with named rows from top to bottom."""
     from matplotlib.figure import Figure  # which nothing but a figure needs
 
-    return Figure(figsize=(7, height), layout="constrained", **options).add_subplot()
-
-
-def _inside(ratios: Any) -> Any:
-    return np.clip(ratios, 1 / LARGEST_RATIO, LARGEST_RATIO)
-
-
-def _finished(ax: Any, names: Sequence[str], label: str) -> Any:
-    """Return the figure of axes with named rows from top to bottom, logarithmic along x."""
+    ax = Figure(figsize=(7, height), layout="constrained", **options).add_subplot()
     ax.set_yticks(range(len(names)), names, fontsize=8)
     ax.set_ylim(len(names) - 0.3, -0.7)
     ax.set_xlabel(label)
     ax.grid(axis="x", alpha=0.25)
-    logarithmic(ax, "x")
-    return ax.figure
+    return ax
+
+
+def _inside(ratios: Any) -> Any:
+    return np.clip(ratios, 1 / LARGEST_RATIO, LARGEST_RATIO)

@@ -230,11 +230,7 @@ def write(folder: Path, question: str, report: Report, made: str, replicates: Ma
     """Write ``README.md`` with the figures, ``metrics.json`` and the file of the replicates: all, or none."""
     pictures = [f"![{title}]({title}.svg)\n" for title in report.figures]
     text = "\n".join([f"# {question}", "", report.text.strip(), "", *pictures, made])
-    files = {
-        **replicates,
-        "README.md": (text + "\n").encode(),
-        "metrics.json": json_text(dict(report.metrics)).encode(),
-    }
+    files = {"README.md": f"{text}\n".encode(), "metrics.json": json_text(dict(report.metrics)).encode(), **replicates}
     for (title, figure), kind in product(report.figures.items(), ("svg", "png")):
         from matplotlib import rc_context  # which nothing but a figure needs
 

@@ -50,11 +50,7 @@ ANGLE_OF = re.compile(r"(?:q|Î¸|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*Â
 """A joint's variable with its offset, ``q2 - 90``."""
 ANGLES = tuple(name for name, dimension in MDH_DIMENSION.items() if dimension == "angle")
 JOINT_NAME = re.compile(r"(?:joint|axis|link|achse|gelenk)[\s_]*\d+", re.IGNORECASE)  # in a cell
-WITHOUT_COLUMN = {
-    "coupling": "a coupling of joints",
-    "mounting": "a mounting other than on the floor",
-    "payload": "a payload",
-}
+WITHOUT_COLUMN = {"coupling": "a coupling of joints", "mounting": "a mounting elsewhere", "payload": "a payload"}
 """What a table with one row per joint has no place for."""
 Mounting = str | list[Annotated[float, Field(strict=False)]]
 """``"floor"``, ``"ceiling"``, ``"wall"``, or where gravity points in the robot's base."""
@@ -207,8 +203,7 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
     known = {CONVENTIONS.get(each, each) for each in conventions}
     if len(known) != 1 or not known <= set(CONVENTIONS.values()):
         accepted = (
-            "--dh modified (Craig, alpha and a before theta and d) or --dh standard (Paul, Hayati: theta and d first), "
-            "or a column `convention` with one of these words"
+            "--dh modified (Craig: alpha and a first) or standard (Paul, Hayati), or this in a column `convention`"
         )
         raise InputError("the convention of the table", " and ".join(sorted(known)) or "not stated", accepted)
     joints = [_joint(dict(zip(columns, cells, strict=True))) for cells in zip(*columns.values(), strict=True)]
@@ -339,15 +334,14 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
     numbers = table[:, :4] / [si for _, si in units.values()]
     rows = [[number, *map(repr, row)] for number, row in enumerate(numbers.tolist(), start=1)]
     write_text(Path(path), csv_text(["joint", *(f"{c}_{unit}" for c, (unit, _) in units.items())], rows))
-    if not far:
-        return notes
-    lost = 1e3 * np.radians(1e-4) * np.abs(table[:, 3]).max()
-    return [
-        *notes,
-        f"{Path(path).name}: use --mdh or --urdf if you can, which have beta. Here nearly parallel axes have their "
-        f"common normal far away ({', '.join(far)}): transfer all digits (angles rounded to 0.0001 degrees cause "
-        f"{lost:.2g} mm of error).",
-    ]
+    if far:
+        lost = 1e3 * np.radians(1e-4) * np.abs(table[:, 3]).max()
+        notes.append(
+            f"{Path(path).name}: use --mdh or --urdf if you can, which have beta. Here nearly parallel axes have their "
+            f"common normal far away ({', '.join(far)}): transfer all digits (angles rounded to 0.0001 degrees cause "
+            f"{lost:.2g} mm of error)."
+        )
+    return notes
 
 
 def _content(robot: Robot) -> dict[str, Any]:

@@ -376,11 +376,12 @@ def _numbers(text: str, count: int, largest: float = LARGEST_NUMBER) -> Array | 
 
 @dataclass(frozen=True, eq=False)
 class _Urdf:
-    """A file's robot: its links, its joints, and the joint above every link that has one."""
+    """A file's robot: its links and joints by name, and the joint above every link that has one."""
 
     data: bytes
     name: str
     links: Mapping[str, _Element]
+    joints: Mapping[str, _Joint]
     above: Mapping[str, _Joint]
 
     def prefixes(self) -> dict[str, _Joint]:
@@ -457,11 +458,6 @@ class _Urdf:
             link = joints[-1].parent
         return joints
 
-    @cached_property
-    def joints(self) -> dict[str, _Joint]:
-        """All joints by name."""
-        return {joint.name: joint for joint in self.above.values()}
-
     def followed(self, joint: _Joint) -> tuple[str, float, float]:
         """Return the joint that moves on its own and by which one moves: its name, and multiplier and offset."""
         factor, offset = 1.0, 0.0
@@ -498,9 +494,9 @@ def _read(path: Path) -> _Urdf:
     links = _named(root.findall("link"))
     if not links:
         raise InputError("the robot", "no links", "elements <link> and <joint>")
+    joints = {name: _Joint(element, name) for name, element in _named(root.findall("joint")).items()}
     above: dict[str, _Joint] = {}
-    for name, element in _named(root.findall("joint")).items():
-        joint = _Joint(element, name)
+    for joint in joints.values():
         for which, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
                 raise joint.error(which, f"no link '{link}'", choices(link, links))
@@ -512,7 +508,7 @@ def _read(path: Path) -> _Urdf:
         TopologicalSorter({child: {joint.parent} for child, joint in above.items()}).prepare()
     except CycleError as error:
         raise InputError(f"link '{error.args[1][0]}'", "a cycle of joints", "a tree") from None
-    return _Urdf(data, root.get("name") or path.stem, links, above)
+    return _Urdf(data, root.get("name") or path.stem, links, joints, above)
 
 
 def _named(elements: Sequence[_Element]) -> dict[str, _Element]:
