@@ -203,7 +203,7 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
     known = {CONVENTIONS.get(each, each) for each in conventions}
     if len(known) != 1 or not known <= set(CONVENTIONS.values()):
         accepted = (
-            "--dh modified (Craig: alpha first), --dh standard (Paul, Hayati: theta first), or a column `convention`"
+            "--dh modified (Craig: alpha first), --dh standard (Paul, Hayati: theta first), or column `convention`"
         )
         raise InputError("the convention of the table", " and ".join(sorted(known)) or "not stated", accepted)
     joints = [_joint(dict(zip(columns, cells, strict=True))) for cells in zip(*columns.values(), strict=True)]
