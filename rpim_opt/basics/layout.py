@@ -463,7 +463,11 @@ def _one_row_each(table: RawTable) -> RawTable:
     texts = {name: [str(cell).strip() for cell in cells] for name, cells in table.columns.items()}
     letters = [cell.lower() for cell in texts.pop(axis)]
     parts = sorted(set(letters))
-    texts = {name: _without_letters(cells, letters) for name, cells in texts.items()}
+    for name, cells in texts.items():
+        pairs = zip(cells, letters, strict=True)
+        points_of = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell, re.IGNORECASE) for cell, letter in pairs]
+        if all(points_of):  # P1.X
+            texts[name] = [match[1] for match in points_of if match]
     points = next(filter(None, (_points(cells, letters) for cells in texts.values())), [])
     if not points:
         accepted = f"a column that names the point, with {', '.join(parts)} once for each point"
@@ -486,13 +490,6 @@ def _names_parts(cells: Sequence[Any]) -> bool:
         return False
     names = sorted({str(cell).strip().lower() for cell in cells})
     return PARTS.fullmatch(" ".join(names)) is not None
-
-
-def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:
-    """Return the names of points where every cell names the coordinate besides, ``P1.X``; others as they are."""
-    pairs = zip(cells, letters, strict=True)
-    named = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell, re.IGNORECASE) for cell, letter in pairs]
-    return [match[1] for match in named if match] if all(named) else cells
 
 
 def _value_column(columns: Mapping[str, Sequence[str]]) -> str:

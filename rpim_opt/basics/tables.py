@@ -14,7 +14,7 @@ import io
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from string import ascii_letters
@@ -426,7 +426,8 @@ def numbers(cells: Sequence[Any], column: str, labels: Sequence[str] = ()) -> np
             return values.astype(float)
     shown = ["" if cell is None else str(cell).strip() for cell in cells]
     values = np.array([numeral(text) for text in shown])
-    for i in np.flatnonzero(np.isnan(values)):
+    if np.isnan(values).any():
+        i = int(np.isnan(values).argmax())
         row = labels[i] if labels else i + 1
         raise InputError(f"row {row}, column {column}", f"'{shown[i][:40]}'", "a finite number")
     return values
@@ -458,14 +459,13 @@ def records(columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
-def columns_csv(columns: Mapping[str, Sequence[Any]], exact: Iterable[str] = ()) -> str:
+def columns_csv(columns: Mapping[str, Sequence[Any]], exact: Collection[str] = ()) -> str:
     """Return columns as CSV; floats with six digits behind the point, nine in ``exact`` ones; empty if not finite."""
-    digits = dict.fromkeys(exact, 9)
 
     def cell(name: str, value: Any) -> Any:
         if not isinstance(value, float):
             return value
-        return f"{value:.{digits.get(name, 6)}f}" if math.isfinite(value) else ""
+        return f"{value:.{9 if name in exact else 6}f}" if math.isfinite(value) else ""
 
     return csv_text(columns, ([cell(name, value) for name, value in row.items()] for row in records(columns)))
 

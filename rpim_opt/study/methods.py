@@ -213,7 +213,7 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
         if each != FOLDER:
             formulation = formulation_of(each)
             ready = next((name for name, known in FORMULATIONS.items() if known is formulation), formulation.name)
-            name = own_name or (each if isinstance(each, str) else ready)
+            name = own_name or ready
             settings["formulation"] = formulation
             if formulation.penalty is None:
                 choices = [(NONE, {"weight": 0.0})]
@@ -235,8 +235,7 @@ def _weight(label: str, each: Any) -> tuple[str, dict[str, Any]]:
     if each is None or isinstance(each, str):
         return label or each or LEARNED, {"weight": weight_of(each)}
     if callable(each):
-        ready = next((name for name, known in SELECTORS.items() if known is each), _name(each))
-        return label or ready, {"weight": each}
+        return label or _name(each), {"weight": each}
     if isinstance(each, bool) or not isinstance(each, int | float | np.number):
         raise InputError("selectors", f"{each!r}", f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}")
     weight = require_weight(number(each, "selectors") if isinstance(each, int) else float(each), "selectors")
