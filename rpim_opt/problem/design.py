@@ -345,17 +345,15 @@ def observe(problem: Source) -> Observability:
     Q, R = np.linalg.qr(A[:, pivot])
     W = np.linalg.solve(R, Q.T @ A[:, rest])
     W = np.where(np.abs(W) > 1e-6, W, 0.0)
-    nulls = []  # a sparse basis of the null space, in the order of the parameters
-    for j, dependent in enumerate(rest):
-        if not blind[dependent]:
-            null = np.zeros(len(x))
-            null[dependent] = 1.0
-            null[pivot] = -W[:, j]
-            null *= free.scale
-            # the first of the largest counts as one, or rounding would choose the sign of d6 - tool_z
-            null /= null[np.argmax(np.abs(null) >= (1 - TIE) * np.abs(null).max())]
-            nulls.append(null)
-    nulls.sort(key=lambda null: tuple(np.flatnonzero(null)))
+    nulls = np.zeros((len(rest), len(x)))  # a sparse basis of the null space
+    nulls[:, pivot] = -W.T
+    nulls[np.arange(len(rest)), rest] = 1.0
+    nulls = nulls[~blind[rest]] * free.scale
+    # the first of the largest counts as one, or rounding would choose the sign of d6 - tool_z
+    size = np.abs(nulls)
+    largest = np.argmax(size >= (1 - TIE) * size.max(axis=1, keepdims=True), axis=1)
+    nulls /= np.take_along_axis(nulls, largest[:, None], axis=1)
+    in_order = sorted(nulls, key=lambda null: tuple(np.flatnonzero(null)))
     base = []
     for i in np.argsort(pivot):
         sums = W[i] * free.scale[pivot[i]] / free.scale[rest]
@@ -364,7 +362,7 @@ def observe(problem: Source) -> Observability:
     return Observability(
         names=free.names, singular_values=s, rank=rank, configurations=configurations,
         unidentifiable=tuple(n for n, b in zip(free.names, blind, strict=True) if b),
-        redundant=tuple({free.names[k]: float(null[k]) for k in np.flatnonzero(null)} for null in nulls),
+        redundant=tuple({free.names[k]: float(null[k]) for k in np.flatnonzero(null)} for null in in_order),
         base=tuple(base), condition=float(s[0] / s[rank - 1]),
         raw_condition=float(raw[0] / raw[-1]) if model.equations >= len(x) and raw[-1] > tiny else float("inf"),
     )  # fmt: skip

@@ -118,7 +118,12 @@ def understand(
     if "rx" in known and rotation not in ("", "extrinsic xyz"):
         columns, meant = _as_quaternions(columns, meant, rotation)
     of_file = {name.lower(): cells for name, cells in raw.columns.items()}
-    table = Understood(columns, of_file, tuple(meant), raw.notes, _doubt(read, robot, options, rotation))
+    turns = [name for name, each in read.items() if each.stem in TURNED and recognize(split(name)[0]).stem in TURNED]
+    named = any(re.search("roll|pitch|yaw", name, re.IGNORECASE) for name in turns)
+    doubt = "rotation" if len(turns) == 3 and not named and not rotation else ""
+    if not options.quaternion and quaternion_columns(read, robot.dof):
+        doubt = "quaternion"
+    table = Understood(columns, of_file, tuple(meant), raw.notes, doubt)
     if not targets:
         table = _rows_with_values(table, robot, kind)
     headed = {UNITS[each.unit].dimension: each for each in meant if each.unit and "in the header" in each.why}
@@ -141,15 +146,6 @@ def _as_quaternions(columns: Columns, meant: Sequence[Meant], rotation: str) -> 
     new = {"meaning": meaning_of_turn, "name": "qw, qx, qy, qz", "unit": ""}
     meant = [each._replace(**new) if each.name in turned else each for each in meant]
     return others | known_names.quaternions(np.column_stack(angles), rotation), meant
-
-
-def _doubt(read: Readings, robot: Robot, options: TableOptions, rotation: str) -> str:
-    """Return the option that only a check against the robot decides, or nothing."""
-    if not options.quaternion and quaternion_columns(read, robot.dof):
-        return "quaternion"
-    turns = [name for name, each in read.items() if each.stem in TURNED and recognize(split(name)[0]).stem in TURNED]
-    named = any(re.search("roll|pitch|yaw", name, re.IGNORECASE) for name in turns)
-    return "rotation" if len(turns) == 3 and not named and not rotation else ""
 
 
 # --- what every column holds ---------------------------------------------------------------------------------------

@@ -8,11 +8,11 @@ with (1 - h)^starts. Lengths do not distinguish an arm from its mirror image.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -346,14 +346,6 @@ def _plainer(
     return both[as_well, :n], Fit(*(each[as_well] for each in tried))
 
 
-class _SameRobot(NamedTuple):
-    """Mappings with equal predictions, the best first: their prediction, and the plainest of them."""
-
-    members: list[int]
-    prediction: Array
-    plainest: int
-
-
 @dataclass(frozen=True, eq=False)
 class _Mappings:
     """Mappings that explain points: signs (B, dof) and fits, those from ``given`` on added by `_plainer`."""
@@ -386,13 +378,12 @@ class _Mappings:
         there = transformed(T[:, None], self.fits.tools[i])
         return there - there.mean(axis=(0, 1)) if self.points.lengths else there
 
-    def robots(self, near: Sequence[int], q: Array, same: float) -> list[_SameRobot]:
-        """Return mappings by what they predict at q (N, dof), to ``same`` [m].
+    def robots(self, there: Mapping[int, Array], same: float) -> list[list[int]]:
+        """Return mappings by the robot that they describe, the best first, from what they predict to ``same`` [m].
 
         A given one belongs to the first whose best predicts what it does. A plainer one belongs to all of which some
         mapping predicts the same, or has its signs and zeros near its own: these are one robot then.
         """
-        there = {i: self.predicted(i, q) for i in near}
 
         def alike(i: int, other: int) -> bool:
             return _apart(there[i], there[other], self.points.lengths) <= same
@@ -402,7 +393,7 @@ class _Mappings:
             return bool((np.abs(turns) < NEAR_ZERO).all() and (self.sign[other] == self.sign[i]).all())
 
         groups: list[list[int]] = []
-        for i in near:
+        for i in there:
             if i < self.given:
                 of = [group for group in groups if alike(i, group[0])][:1]
             else:
@@ -410,18 +401,19 @@ class _Mappings:
             whole = [*(j for group in of for j in group), i]
             place = next((k for k, group in enumerate(groups) if group in of), len(groups))
             groups = [*groups[:place], whole, *(group for group in groups[place:] if group not in of)]
-        return [_SameRobot(group, there[group[0]], min(group, key=self.plain)) for group in groups]
+        return groups
 
-    def same(self, robot: _SameRobot) -> tuple[Alternative, ...]:
+    def same(self, robot: Sequence[int]) -> tuple[Alternative, ...]:
         """Return other descriptions of a robot that change as few joints as its plainest."""
-        first, types = robot.plainest, self.points.robot.joint_types
+        first, *others = sorted(robot, key=self.plain)
+        types = self.points.robot.joint_types
         also = {described(types, self.sign[first], self.zeros[first]): first}
-        for k in sorted(robot.members, key=self.plain):
+        for k in others:
             if self.plain(k)[0] == self.plain(first)[0]:
                 also.setdefault(described(types, self.sign[k], self.zeros[k]), k)
         none = np.zeros(len(types))
-        others = [k for k in also.values() if k != first]
-        return tuple(Alternative(self.sign[k], self.zeros[k], 0.0, none, moved=float(self.moved[k])) for k in others)
+        ways = list(also.values())[1:]
+        return tuple(Alternative(self.sign[k], self.zeros[k], 0.0, none, moved=float(self.moved[k])) for k in ways)
 
 
 def _likely(points: Points, fits: Fit) -> tuple[list[int], np.ndarray]:
@@ -468,25 +460,27 @@ def _judged(
     found = _Mappings(points, sign, fits, given)
     elsewhere = _elsewhere(points, rng)
     same = 0.5 * max(least, LEAST_NOISE)
-    robots = sorted(found.robots(near, elsewhere, same), key=lambda each: found.plain(each.plainest))
-    best = next(each for each in robots if near[0] in each.members)
+    there = {i: found.predicted(i, elsewhere) for i in near}
+    plainest = {min(each, key=found.plain): each for each in found.robots(there, same)}
+    best = next(each for each in plainest.values() if near[0] in each)
 
-    def mirrors(one: _SameRobot, other: _SameRobot) -> bool:
-        return points.lengths and _apart(-one.prediction, other.prediction, True) <= same
+    def mirrors(one: Sequence[int], other: Sequence[int]) -> bool:
+        return points.lengths and _apart(-there[one[0]], there[other[0]], True) <= same
 
     # robots that a plainer mapping describes, and mirror images, are as good as the best
-    first = next(each for each in robots if each is best or mirrors(each, best) or max(each.members) >= given)
-    changes = found.plain(first.plainest)[0]
+    as_good = [i for i, each in plainest.items() if each is best or mirrors(each, best) or max(each) >= given]
+    i = min(as_good, key=found.plain)
+    first = plainest.pop(i)
+    changes = found.plain(i)[0]
     if not changes:
         return None
     others = []
-    for each in robots:
-        if each is not first:
-            far = np.linalg.norm(each.prediction - first.prediction, axis=-1).max(axis=-1)
-            apart = _apart(each.prediction, first.prediction, points.lengths)
-            of = found.sign[each.plainest], found.zeros[each.plainest]
-            others.append(Alternative(*of, apart, elsewhere[int(np.argmax(far))], mirrors(each, first)))
-    i = first.plainest
+    for k in sorted(plainest, key=found.plain):
+        each = there[plainest[k][0]]
+        far = np.linalg.norm(each - there[first[0]], axis=-1).max(axis=-1)
+        apart = _apart(each, there[first[0]], points.lengths)
+        deciding = elsewhere[int(np.argmax(far))]
+        others.append(Alternative(found.sign[k], found.zeros[k], apart, deciding, mirrors(plainest[k], first)))
     nominal = float(rms(fit_arms(Candidates.of([points]), SHORT, robust=True))[0])
     left = float(rms(fits)[i])
     behind = _behind_a_mirror(points, MIRRORED * left)

@@ -1,4 +1,7 @@
-"""JSON and YAML: an object a line or document, an array of objects, or an object of columns."""
+"""Tables as text: JSON and YAML (an object a line or document, an array of objects, an object of columns), MATLAB.
+
+MATLAB's matrices, ``Q = [0 -90; 10 -80];``, have one row per configuration and units in comments.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,9 @@ from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
 MESSAGE = re.compile(r"^name: *\[[^\]]*\]\nposition: *\[", re.MULTILINE)
 """What `rostopic echo` and `ros2 topic echo --flow-style` print of joint states."""
+MATRIX = re.compile(
+    r"(?:%([^\n]*)\n\s*)?^[ \t]*(\w+)[ \t]*=[ \t]*\[([^\]]*)\][ \t]*;?[ \t]*(?:%([^\n]*))?", re.MULTILINE
+)
 
 
 def read(text: str) -> Rows:
@@ -90,8 +96,26 @@ def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
         yield from _flat(whole if prefix else name, part)
 
 
+def read_matlab(text: str) -> Rows:
+    """Return the rows of all matrices, with the only unit that a comment above or behind them names."""
+    columns: dict[str, list[str]] = {}
+    for above, name, inside, behind in MATRIX.findall(text):
+        plain = re.sub(r"%.*|\.\.\.[^\n]*\n", "", inside)
+        rows = [row.strip(" \t,") for row in re.split(r"[;\n]", plain) if row.strip(" \t,")]
+        units = {
+            split(f"{name} [{word}]")[1] for word in re.findall(r"[^\W\d]+|°", behind or above) if word != "in"
+        } - {""}
+        cells = [f"[{row}]" if re.search(r"[\s,]", row) else row for row in rows]
+        columns[f"{name} [{units.pop()}]" if len(units) == 1 else name] = cells
+    if len({*map(len, columns.values())}) > 1:
+        found = ", ".join(f"{name} {len(cells)}" for name, cells in columns.items())
+        raise InputError("the matrices", f"rows of {found}", "matrices with one row per configuration")
+    return records(columns)
+
+
 FORMATS = (
     TableFormat("JSON", (".json", ".jsonl", ".ndjson"), read),
     TableFormat("YAML", (".yaml", ".yml"), read_yaml),
     TableFormat("ROS messages", (".txt", ".log"), lambda text: read_yaml(text) if MESSAGE.search(text) else ()),
+    TableFormat("MATLAB text", (".m",), read_matlab),
 )
