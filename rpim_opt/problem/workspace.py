@@ -255,8 +255,7 @@ def visible_configurations(
         raise InputError("visible_configurations", "no row of a camera", "a problem with eye_in_hand or eye_to_hand")
     block = blocks[0]
     p = problem.parameters
-    values = p.nominal if x is None else p.values_at(x)
-    at = dict(zip(p.names, values.tolist(), strict=True))
+    at = p.by_name(np.zeros(len(p.free)) if x is None else x)
     base = numeric_frame([at[f"base_{c}"] for c in FRAME])
     tool = numeric_frame([at[tool_prefix(block.markers[0]) + c] for c in FRAME])
     camera = {name: at[of_fixture(f"camera_{name}", block.fixture)] for name in INTRINSICS}

@@ -235,8 +235,8 @@ def with_mapping(problem: CalibrationProblem, points: Points, sign: Array, zero:
     robot = mapped(problem.robot, sign, zero)
     fit = fit_arms(Candidates.of([replace(points, robot=robot)]), LONG, robust=True)
     p = problem.parameters
-    values = {f"theta{i}": theta for i, theta in enumerate(robot.mdh[:, 2], start=1)}
-    values |= {f"d{i}": d for i, d in enumerate(robot.mdh[:, 3], start=1)}
+    values = {f"{of}{i}": v for of, k in (("theta", 2), ("d", 3)) for i, v in enumerate(robot.mdh[:, k], start=1)}
+    free = {*p.free.names, *values}
     places = {}
     if not points.lengths:
         places["base_"] = fit.base[0]
@@ -250,7 +250,6 @@ def with_mapping(problem: CalibrationProblem, points: Points, sign: Array, zero:
         places[tool_prefix(name)] = rigid(turn, tool[0])
     for prefix, T in places.items():
         values |= {prefix + c: value for c, value in zip(FRAME, frame_numbers(T), strict=True)}
-    free = {*p.free.names, *[f"{kind}{i}" for kind in ("theta", "d") for i in range(1, len(robot.mdh) + 1)]}
     nominal = np.array(
         [values.get(name, value) if name in free else value for name, value in zip(p.names, p.nominal, strict=True)]
     )
