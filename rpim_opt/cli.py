@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
 from importlib import import_module
-from importlib.metadata import entry_points
 from inspect import Parameter, signature
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -36,29 +35,15 @@ inconclusive: acceptance, or an uncertainty above the nominal robot's error.
 """
 
 
-OTHERS = "rpim_opt.commands"  # entry points that are commands of other packages
 VALUES = {"Path": "PATH", "int": "INTEGER", "float": "NUMBER"}
 """What help calls the values of options, by their types; others are TEXT."""
-PLAIN: Any = {"rich_markup_mode": None, "pretty_exceptions_enable": False}
 
 
 class Commands(TyperGroup):
-    """The commands of this package, then those of other packages, which are loaded at first use."""
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names of the commands; of two with one name that of this package."""
-        return list(dict.fromkeys([*super().list_commands(ctx), *sorted(entry_points(group=OTHERS).names)]))
+    """The commands, whose help names values of options in words."""
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command of a name; one that cannot be loaded reports that when it is called."""
-        others = () if cmd_name in self.commands else entry_points(group=OTHERS, name=cmd_name)
-        for each in others:
-            alone = typer.Typer(add_completion=False, **PLAIN)
-            try:
-                _add(alone, cmd_name, each.load())
-            except Exception as error:  # code of somebody else may raise anything
-                _add(alone, cmd_name, _failing(f"cannot be loaded: {str(error) or type(error).__name__}"))
-            self.commands[cmd_name] = typer.main.get_command(alone)
+        """Return the command of a name."""
         command = super().get_command(ctx, cmd_name)
         if command is not None:
             _name_values(command)
@@ -77,20 +62,7 @@ def _name_values(command: Any) -> None:
             param.metavar = next((word for name, word in VALUES.items() if name in kind), "TEXT")
 
 
-def _add(to: typer.Typer, name: str, function: Callable[..., Any]) -> None:
-    """Add a command, which the list of commands shows with the whole first line of its docstring."""
-    to.command(name, short_help=(function.__doc__ or "").partition("\n\n")[0])(function)
-
-
-def _failing(text: str) -> Callable[[], None]:
-    def fail() -> None:
-        raise RpimError(f"The command {text}.")
-
-    fail.__doc__ = text
-    return fail
-
-
-app = typer.Typer(cls=Commands, no_args_is_help=True, help=HELP, **PLAIN)
+app = typer.Typer(cls=Commands, no_args_is_help=True, help=HELP, rich_markup_mode=None, pretty_exceptions_enable=False)
 # click's, or typer's own copy, depending on typer's version
 USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 INTERRUPTED = 130
@@ -261,7 +233,8 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
             raise typer.Exit(answer.code)
 
     vars(run)["__signature__"] = signature(run).replace(parameters=options)
-    _add(app, function.__name__, run)
+    # the list of commands shows the whole first line of the docstring
+    app.command(function.__name__, short_help=(function.__doc__ or "").partition("\n\n")[0])(run)
     return function
 
 
