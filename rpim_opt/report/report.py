@@ -181,15 +181,26 @@ def _mean_interval(errors: Array) -> str:
 def _accuracy(content: Content) -> Iterator[Block]:
     result = content.result
     record = result.record
-    if content.accepted is not None:
+    found = content.accepted
+    if found is not None:
         yield "heading", f"Acceptance test by {content.tested}" if content.tested else "Acceptance"
-        yield "bullets", _acceptance(result, content.accepted)
+        said = (*found.reasons, found.caution)  # at the top
+        lines = [text for text in found.sentences()[1:] if text not in said]
+        if found.workspace is not None:
+            units = joint_columns(result.problem.robot.joint_dimensions)
+            values = [f"{value / si:.1f}" for value, si in zip(found.workspace.q[-1], units.values(), strict=True)]
+            named = " and ".join(sorted({name.rpartition("_")[2] for name in units}))
+            lines.append(f"The maximum U is at joints {', '.join(values)} {named}.")
+        if found.repeatability is not None and not found.reasons:
+            least = f"{1e3 * found.repeatability:.3f} mm of the maximum U."
+            lines.append(f"Repeatability alone, with all parameters known: {least}")
+        yield "bullets", lines
     yield "heading", "Accuracy"
     used = "Parameters are identified from the identification rows alone."
     if record.held_out is not None:
         used = "Errors of held-out rows are those of a fit without them; the delivered parameters use all rows."
     notes = [summary.nominal_note(result), used]
-    if content.accepted is None:  # otherwise its section says it
+    if found is None:  # otherwise its section says it
         held = record.held_out
         if held is None and record.validation is not None:
             held = held_out_errors(result, record.validation)
@@ -223,19 +234,6 @@ def _new_measurements(content: Content) -> Iterator[Block]:
             yield "figures", [_error_figure(content.result, "new", validation.data)]
 
 
-def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
-    lines = [text for text in found.sentences()[1:] if text not in (*found.reasons, found.caution)]  # said at the top
-    if found.workspace is not None:
-        units = joint_columns(result.problem.robot.joint_dimensions)
-        values = [f"{value / si:.1f}" for value, si in zip(found.workspace.q[-1], units.values(), strict=True)]
-        named = " and ".join(sorted({name.rpartition("_")[2] for name in units}))
-        lines.append(f"The maximum U is at joints {', '.join(values)} {named}.")
-    if found.repeatability is not None and not found.reasons:
-        least = f"{1e3 * found.repeatability:.3f} mm of the maximum U."
-        lines.append(f"Repeatability alone, with all parameters known: {least}")
-    return lines
-
-
 def _error_figure(result: Calibration, name: str, data: Dataset) -> Figure:
     title = "Error of every row before and after calibration"
     return figure(partial(plot.errors, result, data), title, f"All {name} rows.")
@@ -267,11 +265,6 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
     known = zip(units.items(), map_.region.limits, strict=True)
     ranges = [[*name.split("_"), *(f"{end / si:.2f}" for end in ends)] for (name, si), ends in known]
     joints = Table("Joint ranges of the region", ["joint", "unit", "from", "to"], ranges)
-    yield "beside", [("table", _budget(map_, result)), ("table", joints)]
-
-
-def _budget(map_: Workspace, result: Calibration) -> Table:
-    """Return the uncertainty budget of the position reached, by contributor, at the maximum U and over the region."""
     variances = position_budget(result, map_.q, map_.region.marker)
     whole = np.sum(list(variances.values()), axis=0)
     rows = []
@@ -283,7 +276,7 @@ def _budget(map_: Workspace, result: Calibration) -> Table:
     head = ["contributor", "u [mm], maximum U", "share of u²", "u [mm], region (RMS)", "share of u²"]
     factor = map_.largest / np.sqrt(whole[-1])
     title = f"Uncertainty budget of the position reached (GUM; u over all three axes, U is {factor:.2f} u)"
-    return Table(title, head, rows)
+    yield "beside", [("table", Table(title, head, rows)), ("table", joints)]
 
 
 def _parameters(content: Content) -> Iterator[Block]:
@@ -445,7 +438,17 @@ def _provenance(content: Content) -> Iterator[Block]:
         for block in data.blocks:
             what = " ".join(filter(None, [block.measurement.name, *block.markers, block.fixture]))
             blocks.setdefault(f"{name}, {what}", []).append(block)
-    rows = [[what, str(sum(len(each.row) for each in of)), _noise(of)] for what, of in blocks.items()]
+    rows = []
+    for what, of in blocks.items():
+        sigmas = np.concatenate([np.sqrt(np.einsum("nii->ni", block.covariance)) for block in of])
+        components: dict[str, list[str]] = {}  # by their value, as a range where rows differ
+        for (name, dimension), each in zip(of[0].measurement.components.items(), sigmas.T, strict=True):
+            unit, si = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3)}.get(dimension, ("", 1.0))
+            low, high = each.min() / si, each.max() / si
+            value = f"{low:.3g}" if high < 1.005 * low else f"{low:.3g} to {high:.3g}"
+            components.setdefault(f"{value} {unit}".strip(), []).append(name)
+        stated = "; ".join(f"{value} ({', '.join(names)})" for value, names in components.items())
+        rows.append([what, str(len(sigmas)), stated])
     head = ["data", "rows", "standard uncertainty"]
     yield "table", Table("Measurements and their stated standard uncertainties", head, rows, prose=True)
     if record.files:
@@ -482,18 +485,6 @@ def _formulation(result: Calibration) -> str:
     text = f"loss {term(parts['loss'])} of each {parts['loss_over']}, penalty {term(parts['penalty'])}{over}"
     bounds = [term(c) for c in parts["constraints"]]
     return f"{text}, constraints: {', '.join(bounds) or 'none'}"
-
-
-def _noise(blocks: list[Rows]) -> str:
-    """Return the stated standard deviations by component, as a range where rows differ."""
-    spread = np.concatenate([np.sqrt(np.einsum("nii->ni", block.covariance)) for block in blocks])
-    components: dict[str, list[str]] = {}
-    for (name, dimension), sigmas in zip(blocks[0].measurement.components.items(), spread.T, strict=True):
-        unit, si = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3)}.get(dimension, ("", 1.0))
-        low, high = sigmas.min() / si, sigmas.max() / si
-        value = f"{low:.3g}" if high < 1.005 * low else f"{low:.3g} to {high:.3g}"
-        components.setdefault(f"{value} {unit}".strip(), []).append(name)
-    return "; ".join(f"{value} ({', '.join(names)})" for value, names in components.items())
 
 
 def _regularization(content: Content) -> Iterator[Block]:

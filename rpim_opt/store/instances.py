@@ -294,22 +294,19 @@ def _with_known(data: Dataset, table: problem_file.ProblemTable, role: str, path
             known.append(KnownAngle((first, second), each.deg == 0, sigma))
     with in_file(path):
         whole = with_known(data, known)
-        _require_enough(whole)
+        blocks = [(block, block.touched) for block in whole.blocks if block.touched is not None]
+        joined = {name for block, rows in blocks if not block.measurement.touching for names in rows for name in names}
+        touches: dict[str, list[tuple[str, bool]]] = {}  # label and whether a plane is touched, by what is
+        for block, rows in blocks:
+            for i, names in zip(block.row, rows, strict=True):
+                if block.measurement.touching:
+                    touches.setdefault(names[0], []).append((whole.label[i], block.measurement.planar))
+        for name, those in touches.items():  # so few of a point or plane are not informative
+            label, planar = those[-1]
+            least, column = (4, "plane") if planar else (2, "point")
+            if len(those) < least - (name in joined):
+                accepted = (
+                    f"{least} or more, one less where a [[known_distance]] or [[known_angle]] joins it to another"
+                )
+                raise InputError(f"row {label}, column {column}", f"'{name}' touched {len(those)} times", accepted)
     return whole
-
-
-def _require_enough(data: Dataset) -> None:
-    """Refuse points and planes with too few touches to be informative."""
-    blocks = [(block, block.touched) for block in data.blocks if block.touched is not None]
-    joined = {name for block, rows in blocks if not block.measurement.touching for names in rows for name in names}
-    touches: dict[str, list[tuple[str, bool]]] = {}  # label and whether a plane is touched, by what is
-    for block, rows in blocks:
-        for i, names in zip(block.row, rows, strict=True):
-            if block.measurement.touching:
-                touches.setdefault(names[0], []).append((data.label[i], block.measurement.planar))
-    for name, those in touches.items():
-        label, planar = those[-1]
-        least, column = (4, "plane") if planar else (2, "point")
-        if len(those) < least - (name in joined):
-            accepted = f"{least} or more, one less where a [[known_distance]] or [[known_angle]] joins it to another"
-            raise InputError(f"row {label}, column {column}", f"'{name}' touched {len(those)} times", accepted)

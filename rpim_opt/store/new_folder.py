@@ -132,12 +132,15 @@ def new_problem(
         tell(other)
         rows_of(other, on_board(other.columns, board.board), arm, kind)
         tables[validated] = other.columns
+    sources = [*paths, *later]
+    alike = len({file.name for file in sources}) < len(sources)
+    digests = {str(file) if alike else file.name: files.sha256_of(file) for file in sources}
     with in_file(found.file):
         text, guessed = _problem_text(
             arm, source, found, rows.take(np.flatnonzero(~held)), chain=chain, first=not before,
             links={"urdf_base": urdf_base, "urdf_tip": urdf_tip}, target=board.stated, identification=identified,
             columns=how, data=paths[0].name, validation=validated, held_out=held.any(), seed=seed,
-            validated_by=next((file.name for file in later), ""), raw=_digests([*paths, *later]),
+            validated_by=next((file.name for file in later), ""), raw=digests,
         )  # fmt: skip
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items() if any(map(len, each.values()))}
     contents = {name: csv_text(tables[name], zip(*tables[name].values(), strict=True)).encode() for name in counts}
@@ -155,12 +158,6 @@ def new_problem(
 def _assumed(found: Understanding) -> dict[str, float]:
     """Return the noise that is assumed where no column states any."""
     return {} if any(name.startswith(("sigma", "u95")) for name in found.columns) else usual_noise(found.kind)
-
-
-def _digests(supplied: Sequence[Path]) -> dict[str, str]:
-    """Return the SHA-256 of files by name, or by path where two have one name."""
-    alike = len({file.name for file in supplied}) < len(supplied)
-    return {str(file) if alike else file.name: files.sha256_of(file) for file in supplied}
 
 
 def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, rows: Dataset) -> Iterator[str]:

@@ -97,7 +97,16 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     path = _result_path(path)
     stored = read_json(path)
     try:
-        _require_whole(stored)
+        if not isinstance(stored, dict) or stored.get("format") != FORMAT:
+            accepted = "a file of `rpim-opt calibrate --out` or save_result()"
+            raise InputError("the file", "no result of rpim-opt", accepted)
+        if stored.get("version") != VERSION:
+            accepted = f"{VERSION}; read other versions with the rpim-opt that wrote them"
+            raise InputError("key version", repr(stored.get("version"))[:40], accepted)
+        known = str(stored.get("digest", "nothing"))
+        if known != digest(stored):
+            found = f"{known[:12]}, content digest {digest(stored)[:12]}"
+            raise InputError("key digest", found, "the unmodified file: its content was changed")
         file: Stored = _converter().structure(stored, Stored)
         ready = {**READY, **{m.name: m for m in measurements}}
         kinds = {str(block.measurement) for part in file.data.values() for block in part.blocks}
@@ -121,19 +130,6 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
         found = f"inconsistent content ({type(error).__name__}: {error})"
         raise InputError("the file", found, "an unmodified file", path) from None
     return result
-
-
-def _require_whole(stored: Any) -> None:
-    """Refuse what is no result file of this version, or was changed since it was written."""
-    if not isinstance(stored, dict) or stored.get("format") != FORMAT:
-        raise InputError("the file", "no result of rpim-opt", "a file of `rpim-opt calibrate --out` or save_result()")
-    if stored.get("version") != VERSION:
-        accepted = f"{VERSION}; read other versions with the rpim-opt that wrote them"
-        raise InputError("key version", repr(stored.get("version"))[:40], accepted)
-    known = stored.get("digest", "nothing")
-    if known != digest(stored):
-        found = f"{str(known)[:12]}, content digest {digest(stored)[:12]}"
-        raise InputError("key digest", found, "the unmodified file: its content was changed")
 
 
 def _result_path(path: str | Path) -> Path:

@@ -309,7 +309,15 @@ class _Table:
         if bool(points) == bool(planes):
             raise InputError("table simulation", "points_mm and planes", "one of them, for both tables")
         things = {name: np.tile(np.array(place, dtype=float) / 1e3, (each, 1)) for name, place in points.items()}
-        things |= {name: self._on(square, each) for name, square in planes.items()}
+        for name, square in planes.items():  # places that are uniform on it
+            normal = np.array(square.normal, dtype=float)
+            normal /= np.linalg.norm(normal)
+            axis = np.eye(3)[int(np.argmin(np.abs(normal)))]
+            first = axis - normal * np.sum(axis * normal)
+            first /= np.linalg.norm(first)
+            along = square.size * (self.rng.uniform(size=(each, 2)) - 0.5)
+            on_plane = along[:, :1] * first + along[:, 1:] * np.cross(normal, first)
+            things[name] = np.array(square.at_mm) / 1e3 + on_plane
         names = [name for name in things for _ in range(each)]
         labels = [f"{name}_{i}" for name in things for i in range(each)]
         table = {"label": labels, "plane" if planes else "point": names}
@@ -326,14 +334,3 @@ class _Table:
             mine = turn == k
             q[mine] = configurations_at(problem, targets[mine], self.rng, self.x, plan.joint_share, marker)
         return table | self._joints(q[:, None], EXACT_DIGITS)
-
-    def _on(self, square: PlaneTable, count: int) -> Array:
-        """Return places (count, 3) [m] uniform on a square plane."""
-        normal = np.array(square.normal, dtype=float)
-        normal /= np.linalg.norm(normal)
-        axis = np.eye(3)[int(np.argmin(np.abs(normal)))]
-        first = axis - normal * np.sum(axis * normal)
-        first /= np.linalg.norm(first)
-        second = np.cross(normal, first)
-        places = square.size * (self.rng.uniform(size=(count, 2)) - 0.5)
-        return np.array(square.at_mm) / 1e3 + places[:, :1] * first + places[:, 1:] * second

@@ -412,7 +412,16 @@ def _write_ur_calibration(result: Calibration, robot: str, marker: str | None, s
     nominal = result.problem.arms[robot]
     if np.abs(nominal.mdh[0, :2]).max() > 0:
         raise InputError("robot", "alpha1 or a1 that are not zero", "a ready robot of Universal Robots")
-    catalogued = _catalogued(nominal)
+
+    def lengths(mdh: Array) -> Array:  # a is negative in Base only; of parallel axes 2 to 4 the sum of offsets counts
+        return np.array([*np.abs(mdh[:, 1]), *mdh[4:, 3], mdh[1:4, 3].sum()])
+
+    # a controller's deltas count from the ready robot, whatever the calibration began with
+    ready = [read_robot(name) for name in robots() if name.startswith("ur")]
+    apart = [float(np.abs(lengths(each.mdh) - lengths(nominal.mdh)).max()) for each in ready]
+    if min(apart) > ANOTHER_MODEL:
+        raise InputError("robot", nominal.name, "one of Universal Robots' models")
+    catalogued = ready[int(np.argmin(apart))]
     arm, notes = _on_base(identified(result, marker, robot), nominal, catalogued, target)
     mdh = arm.robot.mdh.copy()
     axis = numeric_link(*mdh[0, :2])
@@ -444,19 +453,6 @@ def _of_controller(arm: RobotSetup) -> str:
         f"TCP to enter in PolyScope for the reflector (rotation vector, from the tool flange): {texts[0]}. "
         f"The controller's Base in the instrument's frame (rotation vector): {texts[1]}."
     )
-
-
-def _catalogued(robot: Robot) -> Robot:
-    """Return the ready robot that a controller's deltas count from, whatever the calibration began with."""
-
-    def lengths(mdh: Array) -> Array:  # a is negative in Base only; of parallel axes 2 to 4 the sum of offsets counts
-        return np.array([*np.abs(mdh[:, 1]), *mdh[4:, 3], mdh[1:4, 3].sum()])
-
-    ready = [read_robot(name) for name in robots() if name.startswith("ur")]
-    apart = [float(np.abs(lengths(each.mdh) - lengths(robot.mdh)).max()) for each in ready]
-    if min(apart) > ANOTHER_MODEL:
-        raise InputError("robot", robot.name, "one of Universal Robots' models")
-    return ready[int(np.argmin(apart))]
 
 
 def _on_base(arm: RobotSetup, nominal: Robot, of_file: Robot, file: Path) -> tuple[RobotSetup, list[str]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from rpim_opt.basics.tables import EXCEL
 from rpim_opt.basics.units import display, joint_columns, split_unit
 from rpim_opt.calibration.held_out import registered
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
 from rpim_opt.data.measurements.contact import KNOWN
 from rpim_opt.data.measurements.measurement import Measurement
@@ -74,31 +73,21 @@ def read_targets(
         columns |= dict.fromkeys(absent, [0.0] * len(next(iter(columns.values()))))
         noise = {"position_mm": 1, "orientation_mrad": 1} if oriented else {"position_mm": 1}
         data = read_data(columns, robot, noise, pose if oriented else position)
-        block = _of_targets(data)
+        block, *others = data.blocks
+        if others:
+            raise InputError("column marker", "several reflectors", "targets of one")
+        if block.approach is not None:
+            accepted = "none: joints are in the middle of their backlash"
+            raise InputError("column approach1", "directions of approach", accepted)
     torque = None if block.torque is None else block.torque[:, 0]
     targets = Targets(data.label, data.q if joints else None, block.y if positions else None, torque, block.payload)
-    return targets, _with_orientation(understanding)
-
-
-def _of_targets(data: Dataset) -> Block:
-    """Return the only block of targets; refuse several reflectors, and directions of approach."""
-    block, *others = data.blocks
-    if others:
-        raise InputError("column marker", "several reflectors", "targets of one")
-    if block.approach is not None:
-        accepted = "none: joints are in the middle of their backlash"
-        raise InputError("column approach1", "directions of approach", accepted)
-    return block
-
-
-def _with_orientation(understanding: Understanding) -> Understanding:
-    """Return what was understood with a note on how orientations were read, where there are any."""
     angles = ("rx", "ry", "rz", "qw,")
     turned = [each for table in understanding.tables for each in table.meant if each.name.startswith(angles)]
-    if not turned:
-        return understanding
-    meant = ", ".join(f"{each.column}: {each.meaning.removeprefix('measured ')}" for each in turned)
-    return replace(understanding, notes=(*understanding.notes, f"Orientation of targets: {meant}."))
+    if turned:
+        meant = ", ".join(f"{each.column}: {each.meaning.removeprefix('measured ')}" for each in turned)
+        notes = (*understanding.notes, f"Orientation of targets: {meant}.")
+        understanding = replace(understanding, notes=notes)
+    return targets, understanding
 
 
 class Measured(NamedTuple):
@@ -155,7 +144,11 @@ def read_measurements(
     board = board_of(result.problem.sample().data)
     if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
         columns = on_board(columns, board)
-    noise = _typical_noise([block for block in blocks if block.measurement is calibrated], kind)
+    covariances = [block.covariance for block in blocks if block.measurement is calibrated]
+    variance = np.mean([np.einsum("nii->ni", each).mean(axis=0) for each in covariances], axis=0)
+    sigma = dict(zip(calibrated.components, np.sqrt(variance).tolist(), strict=True))
+    units = {name: display(dimension) for name, dimension in kind.components.items()}
+    noise = {f"{name}_{unit}": sigma[name] / si for name, (unit, si) in units.items()}
     data = rows_of(understanding, columns, RobotSetup(robot), kind, noise)
     name = time_column(understanding.raw)
     clock = None if name is None else (name, tuple(str(cell) for cell in understanding.raw[name]))
@@ -167,14 +160,6 @@ def read_measurements(
         data, motion = registered(result, data)
         notes.append(f"Registered again: the measurements were {motion}.")
     return Measured(data, left_out, tuple(notes), clock)
-
-
-def _typical_noise(blocks: Sequence[Block], kind: Measurement) -> dict[str, float]:
-    """Return the typical standard deviations in blocks that measure a type's components, as ``[noise]`` has them."""
-    variance = np.mean([np.einsum("nii->ni", block.covariance).mean(axis=0) for block in blocks], axis=0)
-    sigma = dict(zip(blocks[0].measurement.components, np.sqrt(variance).tolist(), strict=True))
-    units = {name: display(dimension) for name, dimension in kind.components.items()}
-    return {f"{name}_{unit}": sigma[name] / si for name, (unit, si) in units.items()}
 
 
 def _understood(

@@ -290,7 +290,10 @@ def update(
         prior_inflation, released, left_out,
     )  # fmt: skip
     held_out = None if released else result.record.validation  # which was measured before a change
-    figures = _errors(result, updated, held_out)
+    rows = {"new": updated.problem.data, "held-out": held_out}
+    errors = {name: {"before": result.errors(of), "after": updated.errors(of)} for name, of in rows.items() if of}
+    figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
+    figures = {name: each for name, each in figures.items() if each["after"]["count"]}  # those with lengths
     updated = replace(updated, record=_carried_on(result.record, last, source))
     moved = _moved(result, updated, released, changes)
     vague = _undetermined(result, updated, released)
@@ -307,16 +310,6 @@ def _undetermined(result: Calibration, updated: Calibration, released: Sequence[
             frames.setdefault(free.names[i].rpartition("_")[0], []).append(int(i))
     A = updated.program.model.A  # in standard deviations of the noise, by deviations in units of the scales
     return tuple(name for name, index in frames.items() if np.linalg.matrix_rank(A[:, index], tol=1.0) < len(index))
-
-
-def _errors(
-    result: Calibration, updated: Calibration, held_out: Dataset | None
-) -> dict[str, dict[str, dict[str, Any]]]:
-    """Return statistics of the errors before and after on new and on held-out rows, where they have lengths."""
-    rows = {"new": updated.problem.data, "held-out": held_out}
-    errors = {name: {"before": result.errors(of), "after": updated.errors(of)} for name, of in rows.items() if of}
-    figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
-    return {name: each for name, each in figures.items() if each["after"]["count"]}
 
 
 def _robots(result: Calibration) -> str:
