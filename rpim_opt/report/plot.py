@@ -257,7 +257,10 @@ def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | N
 
 def checks(found: Monitoring, ax: Axes, sums: bool = False) -> None:
     """Draw every check, or their cumulative sum (CUSUM), against its limit."""
-    place = _times(found, ax)
+    place, along = np.arange(1, len(found.label) + 1, dtype=float), "check"
+    if found.when is not None and np.ptp(found.when) > 0:
+        unit, name = next((size, name) for size, name in TIMES if np.ptp(found.when) > 2 * size or size == 1)
+        place, along = (found.when - found.when[0]) / unit, f"{name} since the first check"
     values, allowed, beyond = found.sigmas, found.allowed, list(found.beyond)
     if sums:
         values, allowed = found.sums, np.full(len(place), found.limit)
@@ -266,19 +269,9 @@ def checks(found: Monitoring, ax: Axes, sums: bool = False) -> None:
     ax.plot(place, values, color=COLORS["after"], lw=0.8)
     _dots(ax, place, values, "after", "sum" if sums else "check")
     _dots(ax, place[beyond], values[beyond], "mark")
-    ax.set(ylabel="cumulative sum" if sums else "residual [standard deviations]")
+    ax.set(xlabel=along, ylabel="cumulative sum" if sums else "residual [standard deviations]")
     ax.set_ylim(bottom=0)
     _with_legend(ax)
-
-
-def _times(found: Monitoring, ax: Axes) -> Array:
-    """Return where checks are along x: their times, or their numbers; the axis is labelled so."""
-    if found.when is None or not np.ptp(found.when) > 0:
-        ax.set_xlabel("check")
-        return np.arange(1, len(found.label) + 1, dtype=float)
-    unit, name = next((size, name) for size, name in TIMES if np.ptp(found.when) > 2 * size or size == 1)
-    ax.set_xlabel(f"{name} since the first check")
-    return (found.when - found.when[0]) / unit
 
 
 def _axes(ax: Axes, rows: int = 0, **kwargs: Any) -> Axes:

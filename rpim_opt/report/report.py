@@ -339,14 +339,35 @@ def _transmission(result: Calibration) -> Iterator[Block]:
 
 def _diagnostics(content: Content) -> Iterator[Block]:
     result = content.result
-    for name, blocks in {
-        "Residuals": _residuals(result, content.composition),
-        "Identifiability": _identifiability(result),
-        "Flagged and excluded rows": [_flagged(result)],
-        "Convergence": _convergence(result),
-    }.items():
-        yield "heading", name
-        yield from blocks
+    yield "heading", "Residuals"
+    yield from _residuals(result, content.composition)
+    yield "heading", "Identifiability"
+    yield from _identifiability(result)
+    yield "heading", "Flagged and excluded rows"
+    status = "flagged, in the data"
+    flagged = result.flagged
+    rows = [[f.label, f"{f.sigmas:.1f}", in_unit(f.error, f.dimension), status] for f in flagged[:MOST_FLAGGED]]
+    if len(flagged) > MOST_FLAGGED:
+        rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{status}; result.json names them"])
+    rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]
+    for row in () if result.learned is None else result.learned.left_out:
+        if row.label not in result.record.excluded:
+            error = in_unit(row.error, row.dimension)
+            rows.append([row.label, "", error, f"excluded outlier, {row.ratio:.0f} times the median error"])
+    if rows:
+        yield "table", Table("Largest first", ["row", "standardized residual", "error", "status"], rows, prose=True)
+    else:
+        yield "text", ["No row is flagged or excluded (by chance, one in a hundred good data sets has a flagged row)."]
+    yield "heading", "Convergence"
+    c = result.certificate
+    text = (
+        f"Certificate at the solution: next step of the convex program {c.step:.2g}, constraint "
+        f"violation {c.violation:.2g} (in prior standard deviations)."
+    )
+    yield "text", [result.message, text]
+    history = enumerate(result.history, start=1)
+    rows = [[str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"] for k, it in history]
+    yield "table", Table("Iterations", ["iteration", "objective", "step [prior standard deviations]", "weight"], rows)
 
 
 def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
@@ -385,35 +406,6 @@ def _identifiability(result: Calibration) -> Iterator[Block]:
     indices = ", ".join(f"{name} {value:.3g}" for name, value in observability.indices.items())
     source = "observability indices (Sun and Hollerbach 2008)"
     yield "text", [f"Condition number {observability.condition:.3g}; {source}: {indices}."]
-
-
-def _flagged(result: Calibration) -> Block:
-    flagged = result.flagged
-    status = "flagged, in the data"
-    rows = [[f.label, f"{f.sigmas:.1f}", in_unit(f.error, f.dimension), status] for f in flagged[:MOST_FLAGGED]]
-    if len(flagged) > MOST_FLAGGED:
-        rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{status}; result.json names them"])
-    rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]
-    for row in () if result.learned is None else result.learned.left_out:
-        if row.label not in result.record.excluded:
-            error = in_unit(row.error, row.dimension)
-            rows.append([row.label, "", error, f"excluded outlier, {row.ratio:.0f} times the median error"])
-    if not rows:
-        return "text", ["No row is flagged or excluded (by chance, one in a hundred good data sets has a flagged row)."]
-    head = ["row", "standardized residual", "error", "status"]
-    return "table", Table("Largest first", head, rows, prose=True)
-
-
-def _convergence(result: Calibration) -> Iterator[Block]:
-    c = result.certificate
-    text = (
-        f"Certificate at the solution: next step of the convex program {c.step:.2g}, constraint "
-        f"violation {c.violation:.2g} (in prior standard deviations)."
-    )
-    yield "text", [result.message, text]
-    history = enumerate(result.history, start=1)
-    rows = [[str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"] for k, it in history]
-    yield "table", Table("Iterations", ["iteration", "objective", "step [prior standard deviations]", "weight"], rows)
 
 
 def _provenance(content: Content) -> Iterator[Block]:

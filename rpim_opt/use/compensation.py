@@ -286,9 +286,7 @@ def compensate(
     arm = pick(result.problem.arms, robot, "robot")
     result = in_session(result, robot)
     verdict = accept(result).on(result.verdict) if result.record.requirement else result.verdict
-    note = " ".join(
-        filter(None, [verdict.require(despite_verdict), result.no_intervals, *session_notes(result, robot)])
-    )
+    notes = verdict.require(despite_verdict), result.no_intervals, *session_notes(result, robot)
     targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation is not False)
     if limit is None:
         limit = result.record.requirement.limit if result.record.requirement else np.inf
@@ -299,8 +297,14 @@ def compensate(
         arm = replace(arm, gravity=arm.gravity.carrying(arm.gravity.payload, list(payload_centre)))
     kind = pose if oriented else position
     cell = _Cell.of(result, robot, arm, kind, tool, marker, base, targets.torque is not None)
-    weighed = payload is not None or payload_centre is not None
-    targets = targets._replace(payload=cell.payloads(payload, len(targets.label), weighed))
+    if "payload" in cell.loads.stated:
+        mass = np.asarray(arm.gravity.payload if payload is None else payload, dtype=float)
+        count = len(targets.label)
+        if mass.shape not in ((), (count,)) or not (mass >= 0).all() or not np.isfinite(mass).all():
+            raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {count}")
+        targets = targets._replace(payload=np.broadcast_to(mass, count))
+    elif payload is not None or payload_centre is not None:
+        raise InputError("payload", "a payload without effect on the model", WEIGHED)
     whole, why = _corrected(cell, targets, largest, orientation)
     point = cell.point + why
     expanded = EXPANDED * np.nan_to_num(whole["std"], posinf=0.0)
@@ -316,14 +320,28 @@ def compensate(
             "another arm configuration: state q1, ... with them."
         )
     found = Compensation(
-        result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=point, limit=limit,
-        source=result.record.identity,
+        result.problem.arms[robot], targets.label, **whole, outside=outside, note=" ".join(filter(None, notes)),
+        point=point, limit=limit, source=result.record.identity,
     )  # fmt: skip
     if tool is None:
         return found
-    # the reflector that the stated tool took the place of
+    # why the stated tool is less certain than the reflector, at its least certain row
     reflector = _Cell.of(result, robot, arm, kind, None, cell.marker, base, targets.torque is not None)
-    return replace(found, point=point + _less_known(found, targets, reflector))
+    row = int(np.argmax(found.std))
+    there = Targets._make(None if each is None else each[row : row + 1] for each in targets)
+    known, of_tool = reflector.uncertainty(found.q[row : row + 1], there)[0][0], found.std[row]
+    if not of_tool > LESS_KNOWN * known:
+        return found
+    last = {f"{name}{arm.dof}" for name in ("d", "theta")} & set(reflector.problem.parameters.free.names)
+    advice = "Measure a reflector as far from the flange as this point."
+    if last:
+        advice = (
+            f"No number of reflectors separates {joined(sorted(last))} from the tool: state what is known of the "
+            "flange (`known` in [prior]), or do not identify these parameters."
+        )
+    of_tool, known = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known))
+    point += f" In row {found.label[row]}, U is {of_tool} at the tool and {known} at the reflector. {advice}"
+    return replace(found, point=point)
 
 
 def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool | None) -> tuple[dict[str, Any], str]:
@@ -352,24 +370,6 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
             left = targets_at - transformed(register(there, targets_at), there)
             fields["after_motion"] = rms(np.linalg.norm(left, axis=1))
     return fields, why
-
-
-def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:
-    """Return why a stated tool is less certain than the reflector, at its least certain row; empty where it is not."""
-    row = int(np.argmax(found.std))
-    there = Targets._make(None if each is None else each[row : row + 1] for each in targets)
-    known, of_tool = reflector.uncertainty(found.q[row : row + 1], there)[0][0], found.std[row]
-    if not of_tool > LESS_KNOWN * known:
-        return ""
-    last = {f"{name}{found.robot.dof}" for name in ("d", "theta")} & set(reflector.problem.parameters.free.names)
-    advice = "Measure a reflector as far from the flange as this point."
-    if last:
-        advice = (
-            f"No number of reflectors separates {joined(sorted(last))} from the tool: state what is known of the "
-            "flange (`known` in [prior]), or do not identify these parameters."
-        )
-    of_tool, known = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known))
-    return f" In row {found.label[row]}, U is {of_tool} at the tool and {known} at the reflector. {advice}"
 
 
 def tool_uncertainty(result: Calibration, q: Array, tool: Array | None, marker: str, robot: str) -> tuple[Array, Array]:
@@ -503,17 +503,6 @@ class _Cell(NamedTuple):
             Arm.of(robot, identified, nominal, prefix, moved, kind, loads), loads, problem, x[p.identified],
             own, None if result.no_intervals else result.spread, marker, noise, result.variance_factor, point,
         )  # fmt: skip
-
-    def payloads(self, stated: float | Array | None, count: int, weighed: bool) -> Array | None:
-        """Return the masses (N,) [kg] of N commands, None without effect, which is refused where one is ``weighed``."""
-        if "payload" not in self.loads.stated:
-            if weighed:
-                raise InputError("payload", "a payload without effect on the model", WEIGHED)
-            return None
-        mass = np.asarray(self.robot.gravity.payload if stated is None else stated, dtype=float)
-        if mass.shape not in ((), (count,)) or not (mass >= 0).all() or not np.isfinite(mass).all():
-            raise InputError("payload", f"{stated}", f"a mass [kg] that is not negative, one or {count}")
-        return np.broadcast_to(mass, count)
 
     def begun(self, targets: Targets) -> _Begun:
         """Return the commands for some targets, which the controller's robot reaches by them where it can."""
