@@ -40,26 +40,22 @@ VALUES = {"Path": "PATH", "int": "INTEGER", "float": "NUMBER"}
 
 
 class Commands(TyperGroup):
-    """The commands, whose help names values of options in words."""
+    """The commands; arguments and the values of options are in capitals, in place of Python's types."""
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """Return the command of a name."""
-        command = super().get_command(ctx, cmd_name)
-        if command is not None:
-            _name_values(command)
+        command: Any = super().get_command(ctx, cmd_name)
+        if command is None:
+            return None
+        annotations = signature(command.callback).parameters
+        for param in command.params:
+            if param.param_type_name == "argument":
+                param.metavar = param.name.upper()
+                param.display_type = lambda ctx: ""  # which typer from 0.27 on prints beside it
+            elif not param.is_flag and param.name in annotations:
+                kind = str(annotations[param.name].annotation).partition(",")[0]
+                param.metavar = next((word for name, word in VALUES.items() if name in kind), "TEXT")
         return command
-
-
-def _name_values(command: Any) -> None:
-    """Name arguments and the values of options in capitals, instead of Python's types."""
-    annotations = signature(command.callback).parameters
-    for param in command.params:
-        if param.param_type_name == "argument":
-            param.metavar = param.name.upper()
-            param.display_type = lambda ctx: ""  # which typer from 0.27 on prints beside it
-        elif not param.is_flag and param.name in annotations:
-            kind = str(annotations[param.name].annotation).partition(",")[0]
-            param.metavar = next((word for name, word in VALUES.items() if name in kind), "TEXT")
 
 
 app = typer.Typer(cls=Commands, no_args_is_help=True, help=HELP, rich_markup_mode=None, pretty_exceptions_enable=False)

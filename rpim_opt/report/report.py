@@ -316,10 +316,6 @@ def _parameters(content: Content) -> Iterator[Block]:
             title, caption = f"Deviations of the {dimension} parameters", f"The robot's {dimension} parameters."
             drawn.append(figure(draw, title, caption, 80.0 + 17 * count[dimension]))
     yield "beside", [("table", Table("Identified parameters", head[:columns], rows)), ("figures", drawn)]
-    yield from _transmission(result)
-
-
-def _transmission(result: Calibration) -> Iterator[Block]:
     curves = transmission_errors(result)
     if not curves:
         return
@@ -331,8 +327,9 @@ def _transmission(result: Calibration) -> Iterator[Block]:
     drawn = []
     for each in curves:
         draw = partial(plot.transmission_error, each, factor, largest)
-        joint = str(each).capitalize()
-        caption = f"{joint}: {1e3 * each.rms:.3f} mrad RMS, {mm(1e3 * each.effect)} mm RMS at the tool."
+        caption = (
+            f"{str(each).capitalize()}: {1e3 * each.rms:.3f} mrad RMS, {mm(1e3 * each.effect)} mm RMS at the tool."
+        )
         drawn.append(figure(draw, f"Transmission error of {each}", caption, 200.0))
     yield "figures", drawn
 
@@ -340,7 +337,18 @@ def _transmission(result: Calibration) -> Iterator[Block]:
 def _diagnostics(content: Content) -> Iterator[Block]:
     result = content.result
     yield "heading", "Residuals"
-    yield from _residuals(result, content.composition)
+    yield "text", [words.noise_sentence(result), *content.composition]
+    signed = []
+    what = ""
+    if len(summary.sets(result)) > 1:
+        yield "figures", [_error_figure(result, "identification", result.problem.data)]
+    for name, data in summary.sets(result).items():
+        what, vectors = summary.signed_errors(result, data)
+        for i, axis in enumerate("xyz" if len(vectors["after"]) else ""):
+            means = [f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values()]
+            signed.append([f"{name}, {axis}", *means])
+    if signed:
+        yield "table", Table(f"{what}, mean ± standard deviation [mm]", ["data, axis", "nominal", "identified"], signed)
     yield "heading", "Identifiability"
     yield from _identifiability(result)
     yield "heading", "Flagged and excluded rows"
@@ -368,21 +376,6 @@ def _diagnostics(content: Content) -> Iterator[Block]:
     history = enumerate(result.history, start=1)
     rows = [[str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"] for k, it in history]
     yield "table", Table("Iterations", ["iteration", "objective", "step [prior standard deviations]", "weight"], rows)
-
-
-def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
-    yield "text", [words.noise_sentence(result), *composition]
-    rows = []
-    what = ""
-    if len(summary.sets(result)) > 1:
-        yield "figures", [_error_figure(result, "identification", result.problem.data)]
-    for name, data in summary.sets(result).items():
-        what, vectors = summary.signed_errors(result, data)
-        for i, axis in enumerate("xyz" if len(vectors["after"]) else ""):
-            means = [f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values()]
-            rows.append([f"{name}, {axis}", *means])
-    if rows:
-        yield "table", Table(f"{what}, mean ± standard deviation [mm]", ["data, axis", "nominal", "identified"], rows)
 
 
 def _identifiability(result: Calibration) -> Iterator[Block]:

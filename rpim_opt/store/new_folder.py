@@ -125,7 +125,14 @@ def new_problem(
     kind, how = _kind(arm, found, board, measurement)
     found = replace(found, kind=kind)
     rows = rows_of(found, on_board(found.columns, board.board), arm, kind)
-    held = _held_out(rows, hold_out, seed)
+    held = np.zeros(len(rows), dtype=bool)
+    if hold_out is not None:  # configurations that are drawn at random
+        known = len(np.unique(rows.configuration))
+        if not 0 < hold_out < 1 or known < 2:
+            accepted = "a fraction between 0 and 1 of two or more configurations"
+            raise InputError("--hold-out", f"{hold_out:g} of {known} configurations", accepted)
+        drawn = rows.configurations(min(max(round(hold_out * known), 1), known - 1), seed)
+        held = np.isin(rows.configuration, drawn.configuration)
     tables = {identified: _rows(found.columns, ~held), validated: _rows(found.columns, held), seen: board.table}
     if later:
         other = in_time_order(understand_of(arm, later, kind.name, found.options))
@@ -234,18 +241,6 @@ def _write_whole(folder: Path, contents: Mapping[str, bytes], arm: RobotSetup, s
         made.rename(folder)
 
 
-def _held_out(rows: Dataset, part: float | None, seed: int) -> np.ndarray:
-    """Return which rows (N,) are held out: those of a part of the configurations, drawn at random."""
-    if part is None:
-        return np.zeros(len(rows), dtype=bool)
-    known = len(np.unique(rows.configuration))
-    if not 0 < part < 1 or known < 2:
-        found = f"{part:g} of {known} configurations"
-        raise InputError("--hold-out", found, "a fraction between 0 and 1 of two or more configurations")
-    drawn = rows.configurations(min(max(round(part * known), 1), known - 1), seed)
-    return np.isin(rows.configuration, drawn.configuration)
-
-
 def _rows(columns: Columns, chosen: np.ndarray) -> Columns:
     return {name: [cells[i] for i in np.flatnonzero(chosen).tolist()] for name, cells in columns.items()}
 
@@ -292,20 +287,15 @@ def _kind(
         raise InputError("the target", "nothing", accepted, found.file)
     if measurement is not None:
         return kind, "as stated"
-    if kind.by_camera:
-        return _camera(arm, on_board(found.columns, target.board))
-    if not kind.touching:
+    if kind.touching:
+        column = next(name for name in kind.names if name in found.columns)
+        count = len(set(found.columns[column]))
+        return kind, f"guessed: rows with the same {column} touched it, {count} in all, and nothing else is measured"
+    if not kind.by_camera:
         return kind, f"guessed from the columns {', '.join(kind.columns)}"
-    column = next(name for name in kind.names if name in found.columns)
-    count = len(set(found.columns[column]))
-    return kind, f"guessed: rows with the same {column} touched it, {count} in all, and nothing else is measured"
-
-
-def _camera(arm: RobotSetup, columns: Columns) -> tuple[Measurement, str]:
-    """Return whether the camera is on the flange or beside the robot, by what its poses fit, and how that was found."""
-    misfit = {}  # RMS [m] of the views' poses where base and tool fit best
-    for name, kind in CAMERAS.items():
-        data = read_data(columns, arm.robot, {"pixel_px": 1.0}, kind)
+    misfit = {}  # RMS [m] of the views' poses where base and tool fit best, camera on the flange or beside the robot
+    for name, each in CAMERAS.items():
+        data = read_data(on_board(found.columns, target.board), arm.robot, {"pixel_px": 1.0}, each)
         poses = with_poses(data, starting_cameras(data, {}))
         base, tools, _ = locate(arm.robot, poses, {block.markers[0]: np.zeros(6) for block in poses.blocks})
         placed_so = model_parameters(arm.robot, base, tools).identify(["base_*"])
@@ -314,8 +304,8 @@ def _camera(arm: RobotSetup, columns: Columns) -> tuple[Measurement, str]:
     best, other = sorted(misfit, key=lambda name: misfit[name])
     figures = f"{1e3 * misfit[best]:.3g} mm RMS, {other} {1e3 * misfit[other]:.3g} mm"
     if not misfit[other] > CLEARLY * misfit[best]:
-        found = f"no clear mounting ({best} leaves {figures})"
-        raise InputError("the camera", found, f"--measurement {best} or {other}")
+        ambiguous = f"no clear mounting ({best} leaves {figures})"
+        raise InputError("the camera", ambiguous, f"--measurement {best} or {other}")
     return CAMERAS[best], f"guessed: single views of the board, robot nominal and lens not fitted, leave {figures}"
 
 

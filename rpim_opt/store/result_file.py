@@ -27,7 +27,7 @@ from rpim_opt.calibration.result import Calibration, Iteration
 from rpim_opt.convex import constraints
 from rpim_opt.convex.expressions import LARGEST, NORM1, NORM2, SQUARES, SUM
 from rpim_opt.convex.formulation import Formulation, huber, unavailable
-from rpim_opt.convex.program import Program, pose
+from rpim_opt.convex.program import pose
 from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.convex.robust_loss import kept_equations
 from rpim_opt.convex.rules.selection import Selection, Selector
@@ -363,6 +363,13 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
         weight = SELECTORS.get(file.selection.name, file.weight) if file.selection else file.weight
     extensions = "auto" if learned is not None and learned.trials else "geometry"
     again = partial(calibrate, formulation=formulation, weight=weight, model=extensions)
+    known_already: dict[str, Any] = {"causes": file.causes}  # in place of what the calibration would compute
+    if not program.formulation.solvable:  # as a script's functions cannot be
+        known_already |= {name: getattr(file, name) for name in (*CONSTRAINED, "inliers")}
+        if file.inliers is not None:
+            keep = np.ones(len(program.model.b), dtype=bool)
+            keep[file.inliers.left_out] = False
+            known_already["squares"] = kept_equations(program.model, keep, file.inliers.factor**2)
     return Calibration(
         problem,
         formulation,
@@ -370,7 +377,7 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
         program=program,
         calibrate_again=mapped_as(file.mapping, again),
         record=replace(file.record, validation=validation, digest=file.digest),
-        known=_known(file, program),
+        known=known_already,
     )
 
 
@@ -406,19 +413,6 @@ def _with_measurements(data: Dataset, known: Mapping[str, Measurement], where: s
         session = None if block.session is None else named_sessions(block.session, len(block.row))
         blocks.append(replace(block, measurement=known[name], session=session))
     return replace(data, blocks=tuple(blocks))
-
-
-def _known(file: Stored, program: Program) -> dict[str, Any]:
-    """Return what a file states in place of what the calibration would compute; a script's functions cannot be."""
-    known: dict[str, Any] = {"causes": file.causes}
-    if program.formulation.solvable:
-        return known
-    known |= {name: getattr(file, name) for name in (*CONSTRAINED, "inliers")}
-    if file.inliers is not None:
-        keep = np.ones(len(program.model.b), dtype=bool)
-        keep[file.inliers.left_out] = False
-        known["squares"] = kept_equations(program.model, keep, file.inliers.factor**2)
-    return known
 
 
 # --- dataclasses, named tuples, arrays and mappings as JSON and back, by annotations -----------------------------

@@ -530,9 +530,16 @@ class _Cell(NamedTuple):
         wanted, due = target, np.where(reached[:, None], before - missed, 0.0)
         if not turning:
             wanted, due, W = np.hstack([target[:, :3], pose_before[:, 3:]]), POSITION * due, counts * FIRST
-        P = correction_weights(W @ J, times(W, due), largest)
-        if not turning:
-            P = P + STILL * np.eye(P.shape[1])
+        # P = V diag(p) V' of W J = U diag(s) V', see `compensate`
+        n = J.shape[2]
+        U, s, Vt = np.linalg.svd(W @ J, full_matrices=True)
+        some = s.shape[1]
+        e = np.zeros((len(J), n))
+        e[:, :some] = np.einsum("nij,ni->nj", U, times(W, due))[:, :some]
+        s = np.pad(s, ((0, 0), (0, n - some)))
+        p = np.maximum((e / largest) ** 2 - s**2, 0.0)
+        p += NULL_SPACE_WEIGHT * s[:, :1] ** 2 * (s <= 1e-9 * s[:, :1])
+        P = np.einsum("nki,nk,nkj->nij", Vt, p, Vt) + (0.0 if turning else STILL) * np.eye(n)
         lowest, highest = self.robot.limits.T
         inside = np.clip(commands, lowest, highest)
         limits = np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
@@ -587,7 +594,7 @@ class _Cell(NamedTuple):
         return found(every, best, attainable(self.nominal.at(best, load, poses)[2]))[0]
 
     def _starts(self, poses: Array, loads: int) -> Array:
-        """Return configurations that come near every pose (N, 2 TRIALS, dof).
+        """Return configurations that come near every pose (N, 2 TRIALS, dof), the nearest of many.
 
         First those in the measured joint ranges, of the same elbow and wrist, then any within limits, or a turn.
         """
@@ -595,19 +602,17 @@ class _Cell(NamedTuple):
         low = np.where(np.isfinite(low), low, np.minimum(high, np.pi) - 2 * np.pi)
         high = np.where(np.isfinite(high), high, low + 2 * np.pi)
         q = np.vstack([block.q[:, 0] for block in self.problem.data.blocks])
-        ranges = (q.min(axis=0), q.max(axis=0)), (low, high)
-        return np.hstack([self._near(poses, loads, np.column_stack(limits)) for limits in ranges])
-
-    def _near(self, poses: Array, loads: int, limits: Array) -> Array:
-        """Return the nearest of many configurations within limits (dof, 2) for every pose, (N, TRIALS, dof)."""
-        bank = random_candidates(replace(self.robot, limits=limits), BANK)
-        reached = self.nominal.at(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
-        distance = scipy.spatial.distance.cdist(poses[:, :3], reached[:, :3], "sqeuclidean")
-        if poses.shape[1] == 7:
-            distance += 8 * (1 - np.abs(poses[:, 3:] @ reached[:, 3:].T))  # the angle's square, nearly
-        closest = np.argpartition(distance, TRIALS, axis=1)[:, :TRIALS]
-        order = np.argsort(np.take_along_axis(distance, closest, axis=1), axis=1)
-        return bank[np.take_along_axis(closest, order, axis=1)]
+        starts = []
+        for limits in ((q.min(axis=0), q.max(axis=0)), (low, high)):
+            bank = random_candidates(replace(self.robot, limits=np.column_stack(limits)), BANK)
+            reached = self.nominal.at(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
+            distance = scipy.spatial.distance.cdist(poses[:, :3], reached[:, :3], "sqeuclidean")
+            if poses.shape[1] == 7:
+                distance += 8 * (1 - np.abs(poses[:, 3:] @ reached[:, 3:].T))  # the angle's square, nearly
+            closest = np.argpartition(distance, TRIALS, axis=1)[:, :TRIALS]
+            order = np.argsort(np.take_along_axis(distance, closest, axis=1), axis=1)
+            starts.append(bank[np.take_along_axis(closest, order, axis=1)])
+        return np.hstack(starts)
 
     def norms(self, error: Array) -> tuple[Array, Array]:
         """Return the norms of position and orientation errors; NaN where there is no orientation."""
@@ -765,16 +770,3 @@ def attainable(J: Array) -> Array:
 def times(W: Array, vectors: Array) -> Array:
     """Return matrices (N, k, k) times vectors (N, k), row by row."""
     return (W @ vectors[:, :, None])[:, :, 0]
-
-
-def correction_weights(A: Array, due: Array, largest: float) -> Array:
-    """Return the weights P (N, n, n) of corrections: with A = U diag(s) V', see `compensate`."""
-    n = A.shape[2]
-    U, s, Vt = np.linalg.svd(A, full_matrices=True)
-    some = s.shape[1]
-    e = np.zeros((len(A), n))
-    e[:, :some] = np.einsum("nij,ni->nj", U, due)[:, :some]
-    s = np.pad(s, ((0, 0), (0, n - some)))
-    p = np.maximum((e / largest) ** 2 - s**2, 0.0)
-    p += NULL_SPACE_WEIGHT * s[:, :1] ** 2 * (s <= 1e-9 * s[:, :1])
-    return np.einsum("nki,nk,nkj->nij", Vt, p, Vt)

@@ -164,21 +164,7 @@ def export_files(
         (mdh, lambda target: _write_table(identified(result, marker, robot), dh, target)),
         (robodk, lambda target: write_robodk(identified(result, marker, robot).robot, target)),
     ]
-    writers = _beside([(Path(source), write) for source, write in corrected if source], out)
-    writers += [(Path(target), write) for target, write in made if target]
-    writers = [(to, lambda path, write=write: [*of_geometry, *(write(path) or ())]) for to, write in writers]
-    writers += [(Path(corrections), partial(_write_joint_corrections, whole))] if corrections else []
-    if not writers:
-        options = "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections"
-        raise InputError("export", "nothing to write", f"{options}, one or several")
-    beside = [note] * bool(note)
-    messages = write_all(writers, [f"{whole.record.identity}.", *beside])
-    notes = list(dict.fromkeys([*beside, *of_geometry, *remarks, *messages]))
-    return Exported([target for target, _ in writers], notes, undecided)
-
-
-def _beside(sources: Sequence[tuple[Path, Callable[[Path, Path], Any]]], out: str | Path | None) -> list[Writer]:
-    """Return the writers of corrected files: to ``out``, or of several into that folder."""
+    sources = [(Path(source), write) for source, write in corrected if source]
     if sources and out is None:
         raise InputError("--out", "nothing", f"where to write the corrected {sources[0][0].name}")
     if out is not None and not sources:
@@ -190,7 +176,16 @@ def _beside(sources: Sequence[tuple[Path, Callable[[Path, Path], Any]]], out: st
         if target.resolve() == source.resolve():
             raise InputError("--out", f"the original, {source}", "another file: the original is not overwritten")
         writers.append((target, partial(write, source)))
-    return writers
+    writers += [(Path(target), write) for target, write in made if target]
+    writers = [(to, lambda path, write=write: [*of_geometry, *(write(path) or ())]) for to, write in writers]
+    writers += [(Path(corrections), partial(_write_joint_corrections, whole))] if corrections else []
+    if not writers:
+        options = "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections"
+        raise InputError("export", "nothing to write", f"{options}, one or several")
+    beside = [note] * bool(note)
+    messages = write_all(writers, [f"{whole.record.identity}.", *beside])
+    notes = list(dict.fromkeys([*beside, *of_geometry, *remarks, *messages]))
+    return Exported([target for target, _ in writers], notes, undecided)
 
 
 def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tuple[str, list[str], list[str], bool]:
@@ -442,9 +437,8 @@ def _write_ur_calibration(result: Calibration, robot: str, marker: str | None, s
 def _of_controller(arm: RobotSetup) -> str:
     """Return the TCP and the Base that belong to a robot in files of Universal Robots, as PolyScope states poses."""
     half = np.pi if (arm.robot.mdh[2:4, 1] > 0).all() else 0.0  # from ROS's base_link to Base
-    poses = numeric_frame(arm.tool), numeric_frame(arm.base) @ numeric_link(theta=half)
     texts = []
-    for T in poses:
+    for T in (numeric_frame(arm.tool), numeric_frame(arm.base) @ numeric_link(theta=half)):
         lengths = (f"{name} {1e3 * value:z.3f}" for name, value in zip("XYZ", T[:3, 3], strict=True))
         vector = Rotation.from_matrix(T[:3, :3]).as_rotvec()
         angles = (f"{name} {value:z.5f}" for name, value in zip(("RX", "RY", "RZ"), vector, strict=True))

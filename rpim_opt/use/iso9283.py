@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -193,7 +193,28 @@ def read_approaches(source: Any, units: str = "") -> Performance:
     (2.0, 1.0)
     """
     columns = read_raw(Path(source)).columns if isinstance(source, str | Path) else read_columns(source)
-    pose, attained, commanded = _approach_columns(columns, parse_units(units))
+    stated = parse_units(units)
+    poses: dict[str, str] = {}
+    attained: dict[str, tuple[str, float]] = {}  # name and unit [SI] of the columns of coordinates and angles
+    commanded: dict[str, tuple[str, float]] = {}
+    for name in columns:
+        stem, unit = split(name)
+        meaning = recognize(stem)
+        of = {"measured": attained, "wanted": commanded}.get(meaning.kind or "measured")
+        if meaning.stem in ("configuration", "label"):
+            poses.setdefault(meaning.stem, name)
+        elif of is not None and meaning.stem in {*AXES, *(stem for group in ROTATIONS for stem in group)}:
+            if meaning.stem in of:
+                raise InputError("the header", f"'{of[meaning.stem][0]}' and '{name}'", "one of them")
+            dimension = "length" if meaning.stem in AXES else "angle"
+            unit = unit or stated.get(dimension, "")
+            if not unit or UNITS[unit].dimension != dimension:
+                found = f"column '{name}' without a unit of {dimension}"
+                raise InputError("the header", found, "x_mm, or --units deg,mm")
+            of[meaning.stem] = name, UNITS[unit].si
+    pose = poses.get("configuration", poses.get("label"))
+    if pose is None or not set(AXES) <= set(attained):
+        raise InputError("the header", listed(list(columns), 6), ACCEPTED)
     angles = next((group for group in ROTATIONS if set(group) <= set(attained)), ())
 
     def beside(of: Mapping[str, tuple[str, float]], stems: tuple[str, ...]) -> Any:
@@ -209,32 +230,3 @@ def read_approaches(source: Any, units: str = "") -> Performance:
         texts(columns[pose], pose), beside(attained, AXES), beside(commanded, AXES), beside(attained, angles),
         beside(commanded, angles), angles or ROTATIONS[0],
     )  # fmt: skip
-
-
-def _approach_columns(
-    columns: Iterable[str], stated: Mapping[str, str]
-) -> tuple[str, dict[str, tuple[str, float]], dict[str, tuple[str, float]]]:
-    """Return the column of poses, and name and unit [SI] of attained and of commanded coordinates and angles."""
-    columns = list(columns)
-    poses: dict[str, str] = {}
-    figures: dict[str, dict[str, tuple[str, float]]] = {"measured": {}, "wanted": {}}
-    for name in columns:
-        stem, unit = split(name)
-        meaning = recognize(stem)
-        of = figures.get(meaning.kind or "measured")
-        if meaning.stem in ("configuration", "label"):
-            poses.setdefault(meaning.stem, name)
-        elif of is not None and meaning.stem in {*AXES, *(stem for group in ROTATIONS for stem in group)}:
-            if meaning.stem in of:
-                raise InputError("the header", f"'{of[meaning.stem][0]}' and '{name}'", "one of them")
-            dimension = "length" if meaning.stem in AXES else "angle"
-            unit = unit or stated.get(dimension, "")
-            if not unit or UNITS[unit].dimension != dimension:
-                found = f"column '{name}' without a unit of {dimension}"
-                raise InputError("the header", found, "x_mm, or --units deg,mm")
-            of[meaning.stem] = name, UNITS[unit].si
-    attained, commanded = figures.values()
-    pose = poses.get("configuration", poses.get("label"))
-    if pose is None or not set(AXES) <= set(attained):
-        raise InputError("the header", listed(columns, 6), ACCEPTED)
-    return pose, attained, commanded

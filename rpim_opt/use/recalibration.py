@@ -194,8 +194,8 @@ class Update:
         if self.undetermined:
             lines.append(
                 f"The new rows do not determine the pose of {joined(self.undetermined)}: measure at least three "
-                "configurations with the reflector's positions not on a line, or, where instrument and base stand as "
-                "before, update without --reset. Until then only the robot's own parameters are of use."
+                "configurations with the reflector's positions not on a line, or update without --reset where all "
+                "stands as before."
             )
         for name, of in self.errors.items():
             was, now = (f"{of[when]['rms_mm']:.4f} mm" for when in ("before", "after"))
@@ -294,32 +294,10 @@ def update(
     errors = {name: {"before": result.errors(of), "after": updated.errors(of)} for name, of in rows.items() if of}
     figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
     figures = {name: each for name, each in figures.items() if each["after"]["count"]}  # those with lengths
-    updated = replace(updated, record=_carried_on(result.record, last, source))
-    moved = _moved(result, updated, released, changes)
-    vague = _undetermined(result, updated, released)
-    return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
-
-
-def _undetermined(result: Calibration, updated: Calibration, released: Sequence[str]) -> tuple[str, ...]:
-    """Return frames, released or new, with a direction in which the new rows know less than the prior's scale."""
-    free = updated.problem.parameters.free
-    known = set(result.problem.parameters.free.names).difference(released)
-    frames: dict[str, list[int]] = {}
-    for i in np.flatnonzero(free.of_frames):
-        if free.names[i] not in known:
-            frames.setdefault(free.names[i].rpartition("_")[0], []).append(int(i))
-    A = updated.program.model.A  # in standard deviations of the noise, by deviations in units of the scales
-    return tuple(name for name, index in frames.items() if np.linalg.matrix_rank(A[:, index], tol=1.0) < len(index))
-
-
-def _robots(result: Calibration) -> str:
-    return " and ".join(robot.name for robot in result.problem.arms.values())
-
-
-def _carried_on(record: Record, last: Earlier, source: str) -> Record:
-    """Return the record of an updated calibration: of the earlier one what holds for the new measurements, too."""
+    # of the earlier record what holds for the new measurements, too
+    record = result.record
     first_source = record.source.rpartition(BEFORE)[2]  # what is said of a file belongs to its own measurements
-    return Record(
+    carried_on = Record(
         title=f"{record.title.removesuffix(UPDATED)}{UPDATED}",
         source=f"{source}{BEFORE}{first_source}" if first_source else source,
         excluded=dict.fromkeys(last.excluded, "far outside the prediction intervals of the previous calibration"),
@@ -331,6 +309,21 @@ def _carried_on(record: Record, last: Earlier, source: str) -> Record:
         reading=record.reading,
         terms=record.terms,
     )
+    updated = replace(updated, record=carried_on)
+    moved = _moved(result, updated, released, changes)
+    # frames, released or new, with a direction in which the new rows know less than the prior's scale
+    known = set(result.problem.parameters.free.names).difference(released)
+    frames: dict[str, list[int]] = {}
+    for i in np.flatnonzero(free.of_frames):
+        if free.names[i] not in known:
+            frames.setdefault(free.names[i].rpartition("_")[0], []).append(int(i))
+    A = updated.program.model.A  # in standard deviations of the noise, by deviations in units of the scales
+    vague = tuple(name for name, index in frames.items() if np.linalg.matrix_rank(A[:, index], tol=1.0) < len(index))
+    return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
+
+
+def _robots(result: Calibration) -> str:
+    return " and ".join(robot.name for robot in result.problem.arms.values())
 
 
 def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation: float) -> str:

@@ -8,7 +8,6 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_session, session_prefix
@@ -30,7 +29,7 @@ def in_session(result: Calibration, robot: str = "") -> Calibration:
     """
     problem = result.problem
     names = _sessions(result, robot) if robot in problem.arms else []
-    if not names or problem.session or not isinstance(problem, CalibrationProblem):
+    if not names or problem.session or not problem.keeps_rows:
         return result
     views = [replace(result, problem=replace(problem, session=name)) for name in names]
     if result.no_intervals:
