@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from importlib import import_module
 from types import SimpleNamespace
@@ -370,12 +370,17 @@ class ReducedSquares:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A minimum x (N,) of the canonical form, multipliers of its rows (m,), and the unknowns of the exact loss."""
+    """A minimum x (N,) of the canonical form, multipliers of its rows (m,), and the unknowns of the exact loss.
+
+    Of Clarabel's minima also the slacks of the rows (m,), and the objective but for constants.
+    """
 
     x: Array
     dual: Array
     iterations: int = 0
     rest: Array | None = None
+    slack: Array = field(default_factory=lambda: np.zeros(0))
+    cost: float = np.inf
 
 
 class ReducedProgram:
@@ -398,13 +403,13 @@ class ReducedProgram:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
         p = self.canonical
         if self.loss is not None or not p.polyhedral:
-            return self._by_cones(squares, weight, A, b)[0]
+            return self._by_cones(squares, weight, A, b)
         exact = self._by_active_set(squares, weight, self.working, self.near)
         if exact is not None:
             return exact
-        point, slack = self._by_cones(squares, weight, A, b)
+        point = self._by_cones(squares, weight, A, b)
         active = np.arange(p.zero, p.linear)
-        working = active[(point.dual > slack)[active]]
+        working = active[(point.dual > point.slack)[active]]
         exact = self._by_active_set(squares, weight, working, point.x)
         return point if exact is None else replace(exact, iterations=point.iterations)
 
@@ -451,10 +456,8 @@ class ReducedProgram:
         """Clarabel's data and solver."""
         return _ConicData(self.canonical, self.rows, self.loss, self.counts)
 
-    def _by_cones(
-        self, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
-    ) -> tuple[Point, Array]:
-        """Return Clarabel's minimum, and the slacks of the penalty's rows.
+    def _by_cones(self, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None) -> Point:
+        """Return Clarabel's minimum.
 
         Its tolerances are relative to the size of the unknowns: those are changes of a near point, the last one or that
         of the squares with some weight on |z|^2. A minimum that is far from there, or misses constraints, is refined.
@@ -468,13 +471,11 @@ class ReducedProgram:
         found = self._nearby(near, squares, weight, A, b) if self._walks(weight) else None
         if found is None:
             found = self._about(near, squares, weight, A, b)
-            missed = p.missed(found[0].x)
-            if (missed > ACCEPTED or np.abs(found[0].x - near).max() > FAR) and not len(p.shared):
-                found = self._nearby(found[0].x, squares, weight, A, b, missed) or found
-        point, slack = found
-        self.far = weight if np.abs(point.x - near).max() > FAR and not len(p.shared) else -1.0
-        self.near = point.x
-        return point, slack
+            if (p.missed(found.x) > ACCEPTED or np.abs(found.x - near).max() > FAR) and not len(p.shared):
+                found = self._nearby(found.x, squares, weight, A, b, found) or found
+        self.far = weight if np.abs(found.x - near).max() > FAR and not len(p.shared) else -1.0
+        self.near = found.x
+        return found
 
     def _walks(self, weight: float) -> bool:
         """Return whether the minimum at a weight is as far away as the last one was, along what hardly costs."""
@@ -487,29 +488,38 @@ class ReducedProgram:
         weight: float,
         A: Array | None,
         b: Array | None,
-        missed: float = 0.0,
-    ) -> tuple[Point, Array] | None:
-        """Return the minimum refined from a point (N,), or None where it misses constraints by more than ``missed``."""
-        there = near
+        found: Point | None = None,
+    ) -> Point | None:
+        """Return the minimum refined from a point (N,), or None where it misses constraints by more than ``found``.
+
+        Where none is solved, one in changes of half the size may be. It replaces ``found`` only if it lowers the
+        objective without missing constraints more.
+        """
+        missed = max(FEASIBLE, 0.0 if found is None else self.canonical.missed(found.x))
+        there, size, again = near, np.abs(near).max(), False
         for _ in range(REFINEMENTS):
             try:
-                point, slack = self._refined(there, squares, weight, A, b)
+                point = self._refined(there, size, squares, weight, A, b)
             except Unsolved:
-                return None
-            there = point.x
-            if self.canonical.missed(there) <= max(missed, FEASIBLE, SOUGHT * np.abs(there).max()):
-                return point, slack
+                if found is None:
+                    return None
+                size, again = size / 2, True
+                continue
+            there, size = point.x, np.abs(point.x).max()
+            if self.canonical.missed(there) <= max(missed, 0.0 if again else SOUGHT * size):
+                lower = found is None or point.cost < found.cost
+                return point if lower or not again else None
         return None
 
     def _refined(
-        self, near: Array, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
-    ) -> tuple[Point, Array]:
-        """Return the minimum next to one (N,), in changes of unit size: z = z0 + V min(1 / s, |near|) y, others |near|.
+        self, near: Array, far: float, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
+    ) -> Point:
+        """Return the minimum next to one (N,), in changes of unit size: z = z0 + V min(1 / s, far) y, others far y.
 
         s and V are the singular values and directions of all equations. With small weights some directions of z are
         10^5 scales long and others 10^-4, and costs are below a solver's tolerances.
         """
-        p, far = self.canonical, np.abs(near).max()
+        p = self.canonical
         z0, every = near[p.at], squares.R
         if A is not None:
             every = np.vstack([every, A])
@@ -521,18 +531,18 @@ class ReducedProgram:
         program.data.renumber(changed)
         attempts = ATTEMPTS[1:] if self._walks(weight) else ATTEMPTS  # the first one hardly ever reaches far
         program.data.clarabel.attempts = [(*REFINED, *other) for other in attempts]
+        constant = weight * (p.value(near) - p.offset) + squares.g @ z0
         squares = ReducedSquares(squares.R @ M, squares.y - squares.R @ z0, M.T @ squares.g)
         if A is not None and b is not None:
             A, b = A @ M, b - A @ z0
-        point, slack = program._about(np.zeros(p.size), squares, weight, A, b)
+        point = program._about(np.zeros(p.size), squares, weight, A, b)
         x = far * point.x
         x[p.at] = M @ point.x[p.at]
-        return replace(point, x=near + x, dual=point.dual / far), far * slack
+        cost = constant + point.cost
+        return replace(point, x=near + x, dual=point.dual / far, slack=far * point.slack, cost=cost)
 
-    def _about(
-        self, near: Array, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
-    ) -> tuple[Point, Array]:
-        """Return Clarabel's minimum and the slacks of the penalty's rows; the unknowns are changes of ``near`` (N,)."""
+    def _about(self, near: Array, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None) -> Point:
+        """Return Clarabel's minimum; the unknowns are changes of ``near`` (N,)."""
         data, p, k = self.data, self.canonical, self.rows
         z0 = near[p.at]
         residual = squares.y - squares.R @ z0
@@ -553,7 +563,8 @@ class ReducedProgram:
         x, z, s = np.array(solution.x), np.array(solution.z) / scale, np.array(solution.s)
         x[: p.size] += near
         own = slice(k, k + len(p.b))
-        return Point(x[: p.size], z[own], int(solution.iterations), x[p.size + k :]), s[own]
+        value = solution.obj_val / scale + weight * (p.value(near) - p.offset) + squares.g @ z0
+        return Point(x[: p.size], z[own], int(solution.iterations), x[p.size + k :], s[own], value)
 
 
 class _ConicData:
