@@ -76,6 +76,13 @@ def test_ignored_rows_without_labels_are_named_by_their_numbers(tmp_path: Path) 
     assert "rows without measured values are ignored: 2." in found.notes
 
 
+def test_dates_with_points_are_no_decimal_points(tmp_path: Path) -> None:
+    head, *rows = (HEAD + ROWS).replace(",", ";").splitlines()
+    dated = [f"{head};Datum", *(f"{row},5;01.05.2024" for row in rows)]
+    found = read(write(tmp_path, "\n".join(dated)))
+    assert "decimal commas" in found.notes[-1]
+
+
 def test_points_of_several_arrays_are_named_by_array_and_key(tmp_path: Path) -> None:
     homes = '<Data name="home"><Value key="0" j1="1"/></Data><Data name="cell"><Value key="0" x="7"/></Data>'
     path = write(tmp_path, homes + '<Data name="calib"><Value j1="2"/><Value j1="3"/></Data>', "raw.dtx")

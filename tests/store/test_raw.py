@@ -166,6 +166,9 @@ REFUSED = {
     "two decimal marks": (
         text([HEAD], [["P1", *["1,5"] * 6, *["1.5"] * 3]] * 2, ";"), [], ["'1,5' and '1.5'", "one decimal mark"]
     ),
+    "decimal commas and three decimals": (
+        text([HEAD], [["P1", *["1,5"] * 6, *["401.234"] * 3]] * 2, ";"), [], ["'1,5' and '401.234'", "one decimal mark"]
+    ),
     "decimal commas between commas": (text([HEAD], ROWS, comma=True), [], ["19 cells", "need quotes"]),
     "not the encoding": (text([["Größe", *HEAD[1:]]], ROWS), ["--encoding", "ascii"], ["the text", "--encoding"]),
     "no such separator": (text([HEAD], ROWS), ["--separator", "colon"], ["--separator", "semicolon"]),
