@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import takewhile, zip_longest
+from itertools import filterfalse, takewhile, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,14 @@ BLANK_NAME = re.compile(r"[^\s\[(]+(?:\s+\d+(?!\S))?(?:\s*[\[(][^\])]*[\])])?")
 """A name with its number and unit, in a header whose names and cells are separated by single blanks."""
 PART_OF_PI = re.compile(r"([+-]?)\s*(?:(\d+(?:\.\d*)?)\s*\*?\s*)?(?:π|pi)\s*(?:/\s*(\d+))?", re.IGNORECASE)
 """An angle [rad] as a part of pi, ``-pi/2``."""
-GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
+NUMBER = {
+    mark: re.compile(
+        rf"[+-]?(\d+|(\d*|(?=[\d{mark}]*[{other}])[\d.,]*)[{mark}]\d*|\d*([{other}]\d*){{2,}})(e[+-]?\d+)?", re.I
+    )
+    for mark, other in (".,", ",.")
+}
+"""Numbers by their decimal mark, the last one; what is there more than once alone is the other, 1.234.567."""
+GROUPED = {mark: re.compile(rf"[+-]?[1-9]\d{{0,2}}{re.escape(mark)}\d{{3}}") for mark in ".,"}
 """What may be a whole number with its thousands apart, or one with three decimals."""
 BEYOND = {"angle": 20 * math.pi, "length": 50.0}
 """Joint values and coordinates [SI] that no table has: ten turns, and farther than instruments stand."""
@@ -379,39 +386,24 @@ def _decimal_mark(columns: Mapping[str, Sequence[str]], options: TableOptions) -
     stated = {"comma": ",", "point": "."}.get(options.decimal, options.decimal)
     if stated not in ("", ",", "."):
         raise InputError("--decimal", f"'{stated}'", "comma or point")
-    grouping = "." if stated == "," else ","
-    shown: dict[str, str] = {}  # the first cell with every mark
-    doubtful: list[tuple[str, str]] = []  # numbers whose mark may separate thousands, with their columns
-    for name, cells in columns.items():
-        for cell in cells:
-            mark = _mark(cell)
-            if mark == grouping and GROUPED.fullmatch(cell):
-                doubtful.append((name, cell))
-            elif mark:
-                shown.setdefault(mark, cell)
-    if len(shown) > 1:
-        raise InputError("the numbers", f"'{shown[',']}' and '{shown['.']}'", "one decimal mark")
-    if not shown:
-        beyond = [cell for name, cell in doubtful if _impossible(cell.replace(grouping, ""), name, options)]
-        shown = {grouping: beyond[0]} if beyond else {}
-    mark = next(iter(shown), stated)
-    if doubtful and not mark:
-        found = f"'{doubtful[0][1]}', whose mark may separate thousands or decimals"
-        raise InputError("the numbers", found, "--decimal comma, or --decimal point")
-    mark = mark or "."
-    if stated and mark != stated:
-        return mark, (f"--decimal {options.decimal} does not apply: found '{shown[mark]}'.",)
+    assumed, grouping = (",", ".") if stated == "," else (".", ",")
+    numbers = [(name, cell) for name, cells in columns.items() for cell in cells if is_numeral(cell)]
+    sure = [cell for _, cell in numbers if not GROUPED[grouping].fullmatch(cell)]
+    unfit = {mark: next(filterfalse(NUMBER[mark].fullmatch, sure), "") for mark in NUMBER}
+    if all(unfit.values()):
+        raise InputError("the numbers", f"'{unfit['.']}' and '{unfit[',']}'", "one decimal mark")
+    found = unfit[assumed]
+    if not any(unfit.values()):
+        doubtful = [(name, cell) for name, cell in numbers if grouping in cell]
+        found = next((cell for name, cell in doubtful if _impossible(cell.replace(grouping, ""), name, options)), "")
+        if doubtful and not found and not stated:
+            found = f"'{doubtful[0][1]}', whose mark may separate thousands or decimals"
+            raise InputError("the numbers", found, "--decimal comma, or --decimal point")
+    mark = grouping if found else assumed
+    if stated and found:
+        return mark, (f"--decimal {options.decimal} does not apply: found '{found}'.",)
     why = "as requested" if stated else "no comma can be a thousands separator"
     return mark, (f"decimal commas: {why}.",) if mark == "," else ()
-
-
-def _mark(cell: str) -> str:
-    """Return the last mark of a number, the other one if it is there more than once alone, or an empty text."""
-    last = max(cell.rfind(","), cell.rfind("."))
-    if last < 0 or not is_numeral(cell):
-        return ""
-    mark, other = (",", ".") if cell[last] == "," else (".", ",")
-    return other if other not in cell and cell.count(mark) > 1 else mark  # 1.234.567
 
 
 def _impossible(number: str, name: str, options: TableOptions) -> bool:
