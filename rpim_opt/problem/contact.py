@@ -149,7 +149,8 @@ class Touches:
 
     ``names`` are those of the points and planes, ``rows`` the numbers (K, 3) of the equations of the touches of each,
     ``planar`` which of these are planes, ``ties`` what is known of two of them, ``equations`` how many there are before
-    the elimination.
+    the elimination. ``where`` are the points and planes that contrasts are taken of, located by the nominal robot, and
+    ``spread`` is the RMS distance of its touches from their mean [m].
     """
 
     names: tuple[str, ...]
@@ -157,6 +158,8 @@ class Touches:
     planar: tuple[bool, ...]
     ties: tuple[Tie, ...]
     equations: int
+    where: Features = ()
+    spread: float = 0.0
 
     @classmethod
     def of(cls, data: Dataset) -> Touches | None:
@@ -194,22 +197,22 @@ class Touches:
         p = -residual[np.concatenate(self.rows)]
         return float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
 
-    def centred(self, residual: Array, jacobian: Array, size: float) -> tuple[Array, Array]:
+    def centred(self, residual: Array, jacobian: Array) -> tuple[Array, Array]:
         """Return residual (m,) and Jacobian (m, n) about the points and planes of best fit.
 
         A robot that shrinks to nothing would touch everything at once. What touches leave is therefore counted in
-        units of their spread, times the nominal robot's: they do not determine the size of the robot.
-        ``size`` is that of the nominal robot; touches that spread by less than `CLOSE` count as they are.
+        units of their spread, times the nominal robot's: they do not determine the size of the robot. Touches that
+        spread by less than `CLOSE` count as they are.
         """
         where = self.located(residual)
         spread = self.size(residual)
-        unit = size / spread if size > CLOSE else 1.0
+        unit = self.spread / spread if self.spread > CLOSE else 1.0
         left = residual.copy()
         slopes = jacobian.copy()
         for thing, index in zip(where, self.rows, strict=True):
             left[index] = unit * thing.seen((residual[index] + thing.centre)[:, :, None])[:, :, 0]
             slopes[index] = unit * thing.slopes(jacobian[index])
-        if size > CLOSE:
+        if self.spread > CLOSE:
             every = np.concatenate(self.rows)
             away = -residual[every] - np.mean(-residual[every], axis=0)
             growth = np.einsum("ki,kin->n", away, jacobian[every]) / len(every) / spread**2
@@ -249,38 +252,38 @@ class Touches:
             slopes = [-u @ one.centre, u @ other.centre]
         return off, [(index, np.atleast_2d(G)) for index, G in zip(rows, slopes, strict=True)]
 
-    def kept(self, where: Features) -> np.ndarray:
-        """Return which equations (m,) remain: all but those of touches, and those in whose places contrasts stand."""
+    @cached_property
+    def kept(self) -> np.ndarray:
+        """Which equations (m,) remain: all but those of touches, and those in whose places contrasts stand."""
         mask = np.ones(self.equations, dtype=bool)
-        for thing, index in zip(where, self.rows, strict=True):
+        for thing, index in zip(self.where, self.rows, strict=True):
             mask[index] = False
             mask[thing.kept(index)] = True
         return mask
 
-    def contrasts(self, values: Array, where: Features) -> Array:
+    def contrasts(self, values: Array) -> Array:
         """Return values (m, c) of the equations, as from `centred`, with contrasts in place of touches, (k, c)."""
         contrasts = values.copy()
-        for thing, index in zip(where, self.rows, strict=True):
+        for thing, index in zip(self.where, self.rows, strict=True):
             shown = values[index[:, : len(thing.shown)]]
             contrasts[thing.kept(index)] = np.tensordot(thing.aside.T, shown, axes=1)
-        return contrasts[self.kept(where)]
+        return contrasts[self.kept]
 
-    def noise(self, where: Features) -> scipy.sparse.csr_matrix:
+    def noise(self) -> scipy.sparse.csr_matrix:
         """Return the matrix (k, m) from the noise of the equations to that of the contrasts."""
         transform = scipy.sparse.identity(self.equations, format="lil")
-        for thing, index in zip(where, self.rows, strict=True):
+        for thing, index in zip(self.where, self.rows, strict=True):
             transform[thing.kept(index).ravel()[:, None], index.ravel()] = np.kron(thing.aside.T, thing.shown)
         for tie in self.ties:
-            for index, G in self.through(tie, where)[1]:
+            for index, G in self.through(tie, self.where)[1]:
                 transform[tie.equations[:, None], index.ravel()] = G
-        return transform.tocsr()[self.kept(where)]
+        return transform.tocsr()[self.kept]
 
 
-def contrasted(touches: Touches, stacks: Sequence[Stack], where: Features, stop: np.ndarray) -> list[Stack]:
+def contrasted(touches: Touches, stacks: Sequence[Stack], stop: np.ndarray) -> list[Stack]:
     """Return the noise components of the contrasts, from the equations' ``stacks`` and numbers (m,) of stops."""
-    mask = touches.kept(where)
+    mask, noise = touches.kept, touches.noise()
     place = np.cumsum(mask) - 1
-    noise = touches.noise(where)
     own = np.ones(touches.equations, dtype=bool)
     for tie in touches.ties:
         own[tie.equations] = False  # its touches vary, and not what is stated
@@ -305,7 +308,7 @@ def contrasted(touches: Touches, stacks: Sequence[Stack], where: Features, stop:
     return [Stack(*map(np.stack, zip(*same, strict=True))) for same in by_size.values()]
 
 
-def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Features, reading: bool) -> list[Array]:
+def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], reading: bool) -> list[Array]:
     """Return the covariance of every row's residual about its feature, from those (N, k, k) or (1, k, k) [SI] alone."""
     numbers = [index[:, 0] for index in equation_numbers(data)]
     touch = np.zeros((touches.equations, 3, 3))
@@ -313,7 +316,7 @@ def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Featu
         if block.measurement.touching:
             touch[first] = V
     left = touch.copy()
-    for thing, index in zip(where, touches.rows, strict=True):
+    for thing, index in zip(touches.where, touches.rows, strict=True):
         V = touch[index[:, 0]]
         K = len(V)
         if K > 1:  # what touches are off the thing that they put in its place, of their own
@@ -325,7 +328,9 @@ def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Featu
             left[index[:, 0]] = own
     ties = {}
     for tie in touches.ties:
-        parts = [(G.reshape(-1, *index.shape), touch[index[:, 0]]) for index, G in touches.through(tie, where)[1]]
+        parts = [
+            (G.reshape(-1, *index.shape), touch[index[:, 0]]) for index, G in touches.through(tie, touches.where)[1]
+        ]
         ties[tie.equations[0]] = sum(np.einsum("aki,kij,bkj->ab", G, V, G) for G, V in parts)
     covariances = []
     for block, V, first in zip(data.blocks, each, numbers, strict=True):

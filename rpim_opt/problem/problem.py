@@ -347,8 +347,7 @@ class CalibrationProblem(RobotModel):
         """Return measured minus modelled at the deviations x (n,) [SI], (m,) [SI]."""
         residual = self._uncentred(x)
         if self.touches is not None:
-            nothing = np.zeros((len(residual), 0))
-            residual, _ = self.touches.centred(residual, nothing, self.touches.size(self._nominal_residual))
+            residual, _ = self.touches.centred(residual, np.zeros((len(residual), 0)))
         return residual
 
     def _uncentred(self, x: Array) -> Array:
@@ -362,7 +361,7 @@ class CalibrationProblem(RobotModel):
         jacobian = np.concatenate([J.reshape(-1, len(x)) for _, J in both])
         if self.touches is None or not centred:
             return residual, jacobian
-        return self.touches.centred(residual, jacobian, self.touches.size(self._nominal_residual))
+        return self.touches.centred(residual, jacobian)
 
     def jacobian(self, x: Array) -> Array:
         """Return the identification Jacobian of the modelled values at x (n,), -d residual / dx, (m, n) [SI]."""
@@ -453,25 +452,23 @@ class CalibrationProblem(RobotModel):
         """Number of the row that every equation of `linearize` belongs to, (m,)."""
         if self.touches is None:
             return self._equations.row
-        return self._equations.row[self.touches.kept(self.touched)]
+        return self._equations.row[self.touches.kept]
 
     # Touched points and planes
 
     @cached_property
     def touches(self) -> Touches | None:
-        """Unmeasured points and planes that rows touched; None where there are none."""
-        return Touches.of(self.data)
+        """Unmeasured points and planes that rows touched, located by the nominal robot; None where there are none."""
+        found = Touches.of(self.data)
+        if found is None:
+            return None
+        nominal = self._uncentred(np.zeros(len(self.parameters.free)))
+        return replace(found, where=[each.level for each in found.located(nominal)], spread=found.size(nominal))
 
-    @cached_property
+    @property
     def touched(self) -> Features:
         """Touched points and planes in the base frame, located by the nominal robot."""
-        if self.touches is None:
-            return ()
-        return [thing.level for thing in self.touches.located(self._nominal_residual)]
-
-    @cached_property
-    def _nominal_residual(self) -> Array:
-        return self._uncentred(np.zeros(len(self.parameters.free)))
+        return () if self.touches is None else self.touches.where
 
     def contrasts(self, values: Array) -> Array:
         """Return values (m, c) of the equations with the touched points eliminated, (k, c).
@@ -480,7 +477,7 @@ class CalibrationProblem(RobotModel):
         """
         if self.touches is None:
             return values
-        return self.touches.contrasts(values, self.touched)
+        return self.touches.contrasts(values)
 
     # Noise
 
@@ -510,7 +507,7 @@ class CalibrationProblem(RobotModel):
         if self.touches is None:
             return stacks
         stop = np.unique(self.data.q, axis=0, return_inverse=True)[1].ravel()
-        return contrasted(self.touches, stacks, self.touched, stop[self._equations.row])
+        return contrasted(self.touches, stacks, stop[self._equations.row])
 
     def _stacked(self, groups: Iterable[np.ndarray], joints: bool, at: Array | None) -> list[Stack]:
         """Return groups of equations (N, k) with what divides their noise; arguments as for `stacks`."""
@@ -538,7 +535,7 @@ class CalibrationProblem(RobotModel):
             covariances = [stack.covariance(repeatability, reading) for stack in stacks]
         if self.touches is None:
             return covariances
-        return of_rows(self.touches, self.data, covariances, self.touched, reading)
+        return of_rows(self.touches, self.data, covariances, reading)
 
     def _slopes_by(self, columns: Mapping[str, int], width: int, at: Array | None) -> Array:
         """Return the slopes (m, width) of modelled values by parameters, summed in the columns that these have.

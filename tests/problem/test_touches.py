@@ -143,6 +143,7 @@ def test_elimination_is_a_fit_with_the_points_as_unknowns(data: ro.Dataset, join
     found = Touches.of(data)
     raw, J = drawn(data, found.planar[0])
     where = found.located(raw)
+    found = replace(found, where=where)
     rng = np.random.default_rng(1)
     blocks = [
         replace(b, covariance=b.covariance * rng.uniform(0.3, 3, (len(b.row), 1, 1))) if b.measurement.touching else b
@@ -153,9 +154,9 @@ def test_elimination_is_a_fit_with_the_points_as_unknowns(data: ro.Dataset, join
     repeatability = Repeatability(position=4e-5, joint=2e-5 * joints)
     of = Equations.of(data)
     whole = [of.stack(index, slopes) for index in of.grouped(data.configuration[of.row])]
-    stacks = contrasted(found, whole, where, np.arange(found.equations) // 3)
-    left, moved = found.centred(raw, J, 0.0)
-    r, A = (found.contrasts(v.reshape(found.equations, -1), where) for v in (left, moved))
+    stacks = contrasted(found, whole, np.arange(found.equations) // 3)
+    left, moved = found.centred(raw, J)
+    r, A = (found.contrasts(v.reshape(found.equations, -1)) for v in (left, moved))
     H, h, square, count = 0.0, 0.0, 0.0, 0
     for stack in stacks:
         for index, V in zip(stack.index, stack.covariance(repeatability), strict=True):
