@@ -311,13 +311,29 @@ def calibrate(
     or without a limit the median U, which is above the error of the nominal robot.
     """
     with console.progress() as say:
+        from rpim_opt.calibration.verdict import likely_causes, mistakes
         from rpim_opt.report.summary import describe, summary
+        from rpim_opt.store.problem_file import named_weight
 
         say("reading the problem")
         instance = ro.load(problem, variant)
         requirement = console.requirement_of(limit, box, instance.record.requirement)
         instance = replace(instance, record=replace(instance.record, requirement=requirement))
-        result = _calibrated(instance, selector, formulation, {"model": model, "noise": noise}, say)
+        words = {"model": model, "noise": noise, "formulation": formulation}
+        changes: dict[str, Any] = {key: word for key, word in words.items() if word}
+        if selector:
+            changes["weight"] = named_weight(selector)
+        learning = changes.get("weight", instance.weight) is None
+        say("estimating the prior's scales" if learning else "choosing the weight")
+        changes["progress"] = lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}")
+        try:
+            result = instance.calibrate(**changes)
+        except NoSolutionFound as error:  # where that has likely causes they are named
+            causes = [] if error.conflict else likely_causes(ro.calibrate(instance.problem, ro.tikhonov, weight=1.0))
+            if not mistakes(causes):
+                raise
+            advice = " ".join(causes).rstrip(".")
+            raise NoSolutionFound(error.formulation, error.weight, error.status, advice=advice) from None
         without = [flag.label for flag in result.flagged if drop_outliers and flag.label not in result.clustered]
         if without:
             say("calibrating without outliers")
@@ -707,30 +723,6 @@ def _loaded(result: Path) -> Iterator[tuple["ro.calibration.Calibration", Callab
 def _require_data(register: bool, data: list[Path] | None) -> None:
     if register and not data:
         raise InputError("--register", "no --data", "new measurements to register")
-
-
-def _calibrated(
-    instance: "ro.store.Instance", selector: Text, formulation: Text, words: dict[str, Text], say: Callable[[str], None]
-) -> "ro.calibration.Calibration":
-    """Calibrate with a problem file's settings, or those of options; name likely causes where there is no solution."""
-    from rpim_opt.store.problem_file import named_weight
-
-    changes: dict[str, Any] = {key: word for key, word in {**words, "formulation": formulation}.items() if word}
-    if selector:
-        changes["weight"] = named_weight(selector)
-    say("estimating the prior's scales" if changes.get("weight", instance.weight) is None else "choosing the weight")
-    try:
-        return instance.calibrate(
-            **changes, progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}")
-        )
-    except NoSolutionFound as error:
-        from rpim_opt.calibration.verdict import likely_causes, mistakes
-
-        causes = [] if error.conflict else likely_causes(ro.calibrate(instance.problem, ro.tikhonov, weight=1.0))
-        if not mistakes(causes):
-            raise
-        advice = " ".join(causes).rstrip(".")
-        raise NoSolutionFound(error.formulation, error.weight, error.status, advice=advice) from None
 
 
 def _saved(result: "ro.calibration.Calibration", out: Path | None) -> list[Path]:

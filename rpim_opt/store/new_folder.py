@@ -28,7 +28,7 @@ from rpim_opt.problem.multi_robot import NAME
 from rpim_opt.problem.problem import CalibrationProblem, identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, with_poses
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
-from rpim_opt.robot.chain import MOUNT, ORIGIN, RobotSetup, RowOrigins, placed, row_origins, same_place
+from rpim_opt.robot.chain import MOUNT, ORIGIN, RobotSetup, placed, row_origins, same_place
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.formats.urdf import branching_tip
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
@@ -325,7 +325,12 @@ def _problem_text(
     parameters = starting_parameters(robot, rows, base, tools)
     names = list(identifiable("auto", robot, parameters, rows))
     if context["chain"] and markers == [""]:
-        names = _at_links(names, row_origins(robot.model.terms), base is not None)
+        # fixed joints at the chain's ends, if any, in place of base and tool
+        every = [origin for carried in row_origins(robot.model.terms) for origin in carried.origins]
+        mounts = {origin.up: origin.prefix for origin in every if origin.prefix.startswith(MOUNT)}
+        instead = {"tool_": mounts.get(False, "tool_")} | ({} if base is None else {"base_": mounts.get(True, "")})
+        moved = [(instead.get(frame_of(name), frame_of(name)), name) for name in names]
+        names = [name if frame == frame_of(name) else frame + name.rpartition("_")[2] for frame, name in moved if frame]
     lenses = starting_cameras(rows, {})
     cameras = {
         fixture: {name: lenses[of_fixture(f"camera_{name}", fixture)] for name in list(INTRINSICS)[:4]}
@@ -361,19 +366,6 @@ def _problem_text(
         identify=_patterns(names, len(robot.mdh)),
     )
     return text, how
-
-
-def _at_links(names: Sequence[str], carried: Sequence[RowOrigins], at_base: bool) -> list[str]:
-    """Return parameters of a chain, with those of fixed joints at its ends, if any, in place of base and tool."""
-    mounts = {
-        origin.up: origin.prefix for part in carried for origin in part.origins if origin.prefix.startswith(MOUNT)
-    }
-    instead = {"tool_": mounts.get(False, "tool_")}
-    if at_base:
-        instead["base_"] = mounts.get(True, "")
-    parts = [(frame_of(name), name.rpartition("_")[2], name) for name in names]
-    moved = [(instead.get(frame, frame), axis, name) for frame, axis, name in parts]
-    return [name if frame == frame_of(name) else frame + axis for frame, axis, name in moved if frame]
 
 
 def _base(arm: RobotSetup, rows: Dataset, tools: Mapping[str, Array], kind: Measurement) -> tuple[Array | None, str]:

@@ -15,7 +15,6 @@ from rpim_opt.basics.exceptions import InputError, choices, in_file, pick
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import EXCEL
 from rpim_opt.basics.units import display, joint_columns, split_unit
-from rpim_opt.calibration.held_out import registered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
@@ -27,6 +26,7 @@ from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.store.raw import Understanding, rows_of, understand_of
+from rpim_opt.use.sessions import registered_again
 
 
 class Targets(NamedTuple):
@@ -118,7 +118,7 @@ def read_measurements(
     ``source`` is a text, Excel or Parquet file, a data frame, or a list of them, which are stacked or joined;
     ``measurement`` which of the calibration's measurement types, where it has several. ``options`` are what is stated
     of the tables; what is not, is as it was for the calibration's own. Where the instrument was moved since then, rows
-    ``register``: they are those after the motion that fits them best (`held_out.registered`), which the notes state.
+    ``register``: they are those after the motion that fits them best (`registered_again`), which the notes state.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
@@ -157,8 +157,8 @@ def read_measurements(
     notes = [f"{each.file}: {note}" for each in understanding.tables for note in each.notes if lost.match(note)]
     notes += understanding.notes
     if register:
-        data, motion = registered(result, data)
-        notes.append(f"Registered again: the measurements were {motion}.")
+        data, motion = registered_again(result, data)
+        notes.append(motion)
     return Measured(data, left_out, tuple(notes), clock)
 
 

@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.calibration.held_out import registered
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_session, session_prefix
@@ -36,6 +38,16 @@ def in_session(result: Calibration, robot: str = "") -> Calibration:
         return views[0]
     squares = [np.trace(result.spread.of_positions(_slopes(view, robot)), axis1=1, axis2=2).sum() for view in views]
     return views[int(np.argmin(squares))]
+
+
+def registered_again(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
+    """Return measurements after the motion that fits them best in the frame of `in_session`, and which motion."""
+    session = in_session(result).problem.session
+    if session:  # as rows of another one their intervals would contain the scatter of the instrument's places
+        blocks = (replace(each, session=np.full(len(each.row), session, dtype=object)) for each in data.blocks)
+        data = replace(data, blocks=tuple(blocks))
+    data, motion = registered(result, data)
+    return data, f"Registered again: the measurements were {motion}."
 
 
 def _sessions(result: Calibration, robot: str) -> list[str]:

@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import coverage_text, held_out_errors, registered
+from rpim_opt.calibration.held_out import coverage_text, held_out_errors
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import implausible, misread, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
@@ -20,6 +20,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
 from rpim_opt.problem.diagnosis import shared_rows
 from rpim_opt.use.recalibration import moved_or_changed
+from rpim_opt.use.sessions import registered_again
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -143,8 +144,8 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
     """
     remarks: list[str] = []
     if register:
-        data, motion = registered(result, data)
-        remarks.append(f"Registered again: the measurements were {motion}.")
+        data, motion = registered_again(result, data)
+        remarks.append(motion)
     problem = result.problem.sample()
     held = held_out_errors(result, data)
     touched = touch_errors(data, held.nominal, held.error)

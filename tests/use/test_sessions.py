@@ -108,3 +108,15 @@ def test_the_commands_that_judge_a_robot_judge_it_in_one_session(
     assert run(monkeypatch, "report", str(tmp_path), *new) == 0
     assert "in the instrument&#39;s frame of session" in (tmp_path / "report.html").read_text()
     assert run(monkeypatch, "validate", str(tmp_path), new[1]) == 0
+
+
+def test_measurements_from_a_third_place_are_judged_by_the_robots_uncertainty_once_registered(
+    arm: ro.study.SimulatedArm, result: ro.Calibration
+) -> None:
+    """As rows of an unknown session they were judged by the scatter of the places: a millimetre was no error."""
+    third = numeric_frame([1.0, 0.2, -0.1, 0.01, 0.02, -0.9])
+    y = arm.read.blocks[0].y[:40] @ third[:3, :3].T + third[:3, 3]
+    y[7, 2] += 1e-3
+    found = ro.use.validate(result, ro.Dataset.of(arm.read.q[:40], y, NOISE), register=True)
+    assert found.beyond == (7,)
+    assert any("Registered again" in remark for remark in found.remarks)
