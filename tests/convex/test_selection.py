@@ -12,7 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.convex.rules.curve import _curvature, menger
 from rpim_opt.convex.rules.folds import held_out_error
-from rpim_opt.convex.rules.selection import weight_grid
+from rpim_opt.convex.rules.selection import choice, weight_grid
 from tests.convex.test_formulation import model
 from tests.simulate import simulated
 
@@ -238,3 +238,34 @@ def test_a_rule_reads_a_penalty_with_own_variables_beside_a_robust_loss() -> Non
     program = ro.convex.pose(mine, model(condition=30.0).scaled(np.full(30, 3.0)))
     program.value(np.ones(program.structure.n))  # asked for own variables of the loss as it is
     assert ro.l_curve(program).weight > 0
+
+
+def test_rows_held_out_from_a_loss_with_own_variables_stop_no_solver() -> None:
+    """Huber's loss of norms, written with a variable for each: held-out errors are those of the ready function."""
+
+    def written(v: Any) -> Any:
+        beyond = cp.Variable(v.size, nonneg=True)
+        return cp.sum_squares(cp.pos(v - beyond)) + 4 * cp.sum(beyond)
+
+    problem = ro.load("pose").problem
+    at_nominal = problem.linearize(np.zeros(len(problem.parameters.free)))
+    over = {"loss_over": "configuration", "penalty": cp.sum_squares}
+    weights = np.array([1e-2, 1.0, 1e2, 1e4])
+    own, ready = (
+        held_out_error(ro.convex.pose(ro.Formulation("mine", loss=loss, **over), at_nominal))(weights)
+        for loss in (written, lambda v: cp.sum(cp.huber(v, 2)))
+    )
+    assert own == pytest.approx(ready, rel=1e-5)
+
+
+def test_a_choice_beside_a_weight_that_was_skipped_is_not_inside() -> None:
+    weights, score = np.geomspace(1, 1e4, 5), np.array([3.0, 2.0, 1.0, 2.0, 3.0])
+    inside = choice("mine", weights, score, 2, "least")
+    score[3] = np.nan
+    unsure = choice("mine", weights, score, 2, "least")
+    assert inside.interior
+    assert inside.note == "least"
+    assert not unsure.interior
+    assert unsure.note.endswith(
+        "1 weight skipped, where the solver failed, also beside this one: another weight may be better"
+    )

@@ -116,11 +116,13 @@ EDGES = {
 def choice(name: str, weights: Array, score: Array, best: int, note: str, at_edge: str = "") -> Selection:
     """Return the selection of one of some weights (K,), with its note at an edge; NaN is where the solver failed."""
     failed = np.isnan(score)
-    interior = 0 < best < len(weights) - 1
-    if not interior:
+    inside = 0 < best < len(weights) - 1
+    if not inside:
         note = at_edge or EDGES["lower" if best == 0 else "upper"]
     note += skipped(int(failed.sum()))
-    return Selection(float(weights[best]), name, weights[~failed], score[~failed], interior, note)
+    beside = inside and bool(failed[[best - 1, best + 1]].any())
+    note += ", also beside this one: another weight may be better" * beside
+    return Selection(float(weights[best]), name, weights[~failed], score[~failed], inside and not beside, note)
 
 
 def solved(program: Program, weights: Sequence[float] | Array) -> list[Estimate | None]:
