@@ -282,7 +282,5 @@ def visible_configurations(
         visible = np.concatenate([visible, q[before & inside & large & upright]])
         if len(visible) >= count:
             return visible[:count]
-    found_text = f"{len(visible)} of {count} views in which the board is visible"
-    raise InputError(
-        "visible_configurations", found_text, "frames, a share and an image for which it is visible more often"
-    )
+    accepted = "frames, a share and an image for which it is visible more often"
+    raise InputError("visible_configurations", f"{len(visible)} of {count} views with a visible board", accepted)

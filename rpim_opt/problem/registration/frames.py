@@ -206,10 +206,9 @@ def problem_from(
 def _frame(value: Any, name: str) -> Array:
     """Return the six numbers of a frame that is stated by them or by its transform."""
     accepted = "six finite numbers x, y, z [m], roll, pitch, yaw [rad], or a transform (4, 4)"
-    try:
+    numbers = np.zeros(0)
+    with suppress(TypeError, ValueError):
         numbers = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(name, f"{value!r}", accepted) from None
     if numbers.shape not in ((6,), (4, 4)) or not np.isfinite(numbers).all():
         raise InputError(name, f"{value!r}", accepted)
     return numbers if numbers.ndim == 1 else np.array(frame_numbers(numbers))
