@@ -730,7 +730,7 @@ def _saved(result: "ro.calibration.Calibration", out: Path | None) -> list[Path]
     if out is None:
         return []
     file = inside(out, "result.json", "the file", out)
-    ro.store.save_result(result, file)
+    ro.store.save_result(ro.use.in_session(result), file)  # with the acceptance that is printed
     return [file]
 
 

@@ -14,7 +14,7 @@ from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_session, session_prefix
 
-FEW = 6  # sessions that are listed, the first ones
+FEW, SOME = 6, 100  # sessions that are listed, the first ones; measured configurations that stand for all, at most
 
 
 def in_session(result: Calibration, robot: str = "") -> Calibration:
@@ -63,6 +63,7 @@ def _slopes(view: Calibration, robot: str) -> Array:
     problem = view.problem.sample()
     blocks = [block for block in problem.data.blocks if block.robot == robot]
     q = np.concatenate([block.q[:, 0] for block in blocks])
+    q = q[:: -(-len(q) // SOME)]
     there = problem.measuring(q, marker=blocks[0].markers[0], robot=robot)
     return there.jacobian(view.x).reshape(len(q), 3, -1)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -97,7 +99,8 @@ def test_exported_base_and_table_are_of_that_session_and_others_are_relative_to_
 def test_the_commands_that_judge_a_robot_judge_it_in_one_session(
     monkeypatch, capsys, arm: ro.study.SimulatedArm, result: ro.Calibration, tmp_path: Path
 ) -> None:
-    ro.store.save_result(result, tmp_path)
+    required = replace(result.record, requirement=ro.data.Requirement(5e-4))
+    ro.store.save_result(replace(result, record=required), tmp_path)
     rows = arm.read.blocks[0]
     header = [*(f"q{i}_rad" for i in range(1, 7)), "x_m", "y_m", "z_m", "session"]
     cells = [[*map(repr, map(float, [*q, *y])), "near"] for q, y in zip(arm.read.q, rows.y, strict=True)]
@@ -108,6 +111,12 @@ def test_the_commands_that_judge_a_robot_judge_it_in_one_session(
     assert run(monkeypatch, "report", str(tmp_path), *new) == 0
     assert "in the instrument&#39;s frame of session" in (tmp_path / "report.html").read_text()
     assert run(monkeypatch, "validate", str(tmp_path), new[1]) == 0
+    assert run(monkeypatch, "update", str(tmp_path), new[1], "--out", str(tmp_path / "later")) == 0
+    updated = ro.load_result(tmp_path / "later")
+    stored = json.loads((tmp_path / "later" / "result.json").read_text())["acceptance"]["bound_mm"]
+    mapped = measured_workspace(ro.use.in_session(updated))
+    assert mapped is not None
+    assert abs(stored - 1e3 * mapped.largest) < 1e-6 * stored
 
 
 def test_measurements_from_a_third_place_are_judged_by_the_robots_uncertainty_once_registered(
