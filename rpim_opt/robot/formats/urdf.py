@@ -145,9 +145,12 @@ def write_urdf(
     way = urdf.way(base, tip)
     table = describe(way.chain)[0]
     edits: dict[tuple[int, int], str] = {}
-    followers = urdf.followers()
+    mimics = {name: joint.element.find("mimic") for name, joint in urdf.joints.items()}
+    led = {name: mimic.get("joint", "") for name, mimic in mimics.items() if mimic is not None}
     for joint, old, new in zip(way.joints, way.joint_map, robot.joint_map, strict=False):
-        if joint in followers and not np.array_equal(old, new):
+        # of a joint that follows one that moves on its own, and that none follows
+        alone = joint.name in led and led[joint.name] not in led and joint.name not in led.values()
+        if alone and not np.array_equal(old, new):
             old[old != 0] = new[old != 0]  # the multiplier, and zeros
             edits |= joint.edits(urdf.data, "mimic", {"multiplier": repr(float(old.sum()))})
     kinds = tuple(joint.kind for joint in way.joints)
@@ -393,13 +396,6 @@ class _Urdf:
                 found = f"the parameters {joint.prefix}* of joint '{other.name}', too"
                 raise joint.error("name", found, "names that differ in letters or digits")
         return known
-
-    def followers(self) -> list[_Joint]:
-        """Return the joints that follow one that moves on its own, and that none follows."""
-        mimics = {joint.name: joint.element.find("mimic") for joint in self.joints.values()}
-        following = {name: mimic.get("joint", "") for name, mimic in mimics.items() if mimic is not None}
-        ends = [name for name, led in following.items() if led not in following and name not in following.values()]
-        return [self.joints[name] for name in ends]
 
     def steps_between(self, base: str | None, tip: str | None) -> list[_Step]:
         """Return the steps from link ``base`` to link ``tip``; by default from the root to the only leaf."""
