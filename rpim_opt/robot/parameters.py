@@ -158,7 +158,8 @@ class Parameters(Tabled):
         """Return name, unit, and in it the figures (P,) [SI] of every parameter; None for infinite ones."""
         rows: list[dict[str, Any]] = []
         for i, (name, dimension) in enumerate(zip(self.names, self.dimensions, strict=True)):
-            unit, si = display(dimension)
+            # a joint's deflection under gravity, as compliances state it
+            unit, si = ("mrad", 1e-3) if own_name(name).startswith("bend") else display(dimension)
             figures = {column: float(values[i] / si) for column, values in columns.items()}
             known = {column: value if np.isfinite(value) else None for column, value in figures.items()}
             rows.append({"parameter": name, "unit": unit, **known})
