@@ -738,7 +738,12 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
     if not single:  # a noise that was learned takes up what is looked for
         problem = problem.with_repeatability(None)
     model = problem.linearize(x)
-    acceptable = _acceptable_part(problem, x)
+    # a cause that leaves more than instrument and robot do is beyond its linearization, or one of several mistakes
+    norms, count = problem.with_repeatability(None).whitened_errors(x)
+    of_noise = NOISY * np.sqrt(count.sum()) / np.sqrt(max(float(norms @ norms), TINY))
+    largest = {"length": REACH * arm_length(problem.robot, problem.data.blocks), "angle": ANGULAR}
+    own = [part / size for each, part in largest.items() if (size := rms(problem.errors(x, each))) > TINY]
+    acceptable = min(max(of_noise, min(own, default=0.0)), 1.0)
     most = min(MOVED if most is None else most, acceptable**2)
     moves = _moves(problem, x, along_joints=most <= MOVED)
     best = _explained(model, x, chain(moves, _gears(problem, model), _scales(problem, x, model)), most)
@@ -762,18 +767,6 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
         said = [_said_of_kinds(problem, rows, part)] if kinds else ()
         noise = _uneven_noise(problem, x) if acceptable == 1 else ()  # else errors are too large for noise
         yield from first(two_positions(problem, x, min(limit, part / MOVED) if kinds else limit), said, noise)
-
-
-def _acceptable_part(problem: CalibrationProblem, x: Array) -> float:
-    """Return which part of the residuals at x (n,) a cause may leave: that of instrument and robot by themselves.
-
-    A cause that leaves more is beyond its linearization, or one of several mistakes at best.
-    """
-    norms, count = problem.with_repeatability(None).whitened_errors(x)
-    noise = NOISY * np.sqrt(count.sum()) / np.sqrt(max(float(norms @ norms), TINY))
-    largest = {"length": REACH * arm_length(problem.robot, problem.data.blocks), "angle": ANGULAR}
-    own = [most / size for each, most in largest.items() if (size := rms(problem.errors(x, each))) > TINY]
-    return min(max(noise, min(own, default=0.0)), 1.0)
 
 
 def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[str]:

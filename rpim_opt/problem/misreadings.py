@@ -458,7 +458,10 @@ def better_reading(problem: CalibrationProblem, whole: bool = True) -> Better | 
             first = [each for readings in further for each in readings(points)]
             chain, left = _chain(points, present, first, BETTER * present, 2)
     fits = left < BETTER * present and (left <= LEFT or points.seen)
-    fits = fits and _is_no_chance(points, len(chain), left / present)
+    if fits:  # F test of two fits with the same spare equations, times the choices: few rows fit some of them well
+        equations = points.y.size if points.turns is None else 2 * points.y.size
+        spare = max(equations - len(FRAME) - points.tools.size - max(points.robot.dof - 2, 0), 1)
+        fits = bool(fdtr(spare, spare, (left / present) ** 2) * len(_readings(points)) ** len(chain) < RARE)
     if mapping is not None and not (fits and left * points.extent < mapping.left):
         return _of_mapping(mapping)
     if fits:
@@ -484,16 +487,6 @@ def _chain(
         points = each[0].change(points)
         readings = _readings(points)
     return chain, left
-
-
-def _is_no_chance(points: Points, mistakes: int, left: float) -> bool:
-    """Whether chance makes a choice of so many mistakes leave that part of the error less than once in a million.
-
-    An F test of two fits with the same spare equations, times the number of choices: few rows fit some of them well.
-    """
-    equations = points.y.size if points.turns is None else 2 * points.y.size
-    spare = max(equations - len(FRAME) - points.tools.size - max(points.robot.dof - 2, 0), 1)
-    return bool(fdtr(spare, spare, left**2) * len(_readings(points)) ** mistakes < RARE)
 
 
 def _of_mapping(mapping: JointMapping) -> Better:

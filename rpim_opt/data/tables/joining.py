@@ -146,9 +146,11 @@ def _by_key(joints: Understood, values: Understood, key: str) -> Match:
         raise InputError(f"the key {chosen.how}", f"'{twice}' twice in {joints.file}", "unique keys")
     right = [i for i, name in enumerate(chosen.right) if name in place]
     if not right:
-        within = _clock_tolerance(joints, values)
-        if within and not key:
-            return _by_time(joints, values, key, within)
+        if not key and all(time_column(side.raw) is not None and len(side.labels) > 1 for side in (joints, values)):
+            there, then = (_times(side, "")[1] for side in (joints, values))
+            within = SIMULTANEOUS * float(min(np.diff(np.sort(there)).min(), np.diff(np.sort(then)).min()))
+            if within and len(partners(there, then, within)[1]) == len(then):
+                return _by_time(joints, values, key, within)
         names = [f"{side.file} ({listed(keys, 3)})" for side, keys in ((joints, chosen.left), (values, chosen.right))]
         found = f"no common value in {' and '.join(names)}"
         raise InputError(f"the key {chosen.how}", found, f"--key with a column of common values, {OTHER_KEYS}")
@@ -332,15 +334,6 @@ def _motion(joints: Understood, times: Array, rows: np.ndarray, moments: Array) 
             values = np.degrees(unit.si * np.array([numeral(str(cell)) for cell in cells]))
             largest = np.fmax(largest, np.abs(np.interp(moments, times[order], values[order]) - values[rows]))
     return largest
-
-
-def _clock_tolerance(joints: Understood, values: Understood) -> float:
-    """Return a small part of the time between rows [s] where every measured row has a partner within it, else 0."""
-    if any(time_column(side.raw) is None or len(side.labels) < 2 for side in (joints, values)):
-        return 0.0
-    there, then = (_times(side, "")[1] for side in (joints, values))
-    within = SIMULTANEOUS * float(min(np.diff(np.sort(there)).min(), np.diff(np.sort(then)).min()))
-    return within if len(partners(there, then, within)[1]) == len(then) else 0.0
 
 
 def _times(table: Understood, key: str) -> tuple[str, Array]:

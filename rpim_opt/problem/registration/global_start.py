@@ -426,16 +426,6 @@ def _likely(points: Points, fits: Fit) -> tuple[list[int], np.ndarray]:
     return [int(i) for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS], inliers
 
 
-def _elsewhere(points: Points, rng: np.random.Generator) -> Array:
-    """Return configurations (N, dof) within the joint limits and wherever joints were measured."""
-    measured = points.q.reshape(-1, points.robot.dof)
-    low, high = measured.min(axis=0), measured.max(axis=0)
-    ends = np.where(_turning(points.robot), [[-np.pi], [np.pi]], [low, high])
-    limits = points.robot.limits.T
-    ends = np.where(np.isfinite(limits), limits, ends)
-    return rng.uniform(np.minimum(ends[0], low), np.maximum(ends[1], high), (COMPARED, points.robot.dof))
-
-
 def _judged(
     points: Points,
     problem: CalibrationProblem | None,
@@ -457,7 +447,13 @@ def _judged(
         near += range(given, given + len(plainer))
         sign, fits = np.vstack([sign, plainer]), stacked([fits, more])
     found = _Mappings(points, sign, fits, given)
-    elsewhere = _elsewhere(points, rng)
+    # within the joint limits, and wherever joints were measured
+    measured = points.q.reshape(-1, points.robot.dof)
+    low, high = measured.min(axis=0), measured.max(axis=0)
+    limits = points.robot.limits.T
+    ends = np.where(_turning(points.robot), [[-np.pi], [np.pi]], [low, high])
+    ends = np.where(np.isfinite(limits), limits, ends)
+    elsewhere = rng.uniform(np.minimum(ends[0], low), np.maximum(ends[1], high), (COMPARED, points.robot.dof))
     same = 0.5 * max(least, LEAST_NOISE)
     there = {i: found.predicted(i, elsewhere) for i in near}
     plainest = {min(each, key=found.plain): each for each in found.robots(there, same)}
