@@ -144,8 +144,10 @@ def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
             seen = np.hstack([block.y[view], np.ones((len(view), 1))]) @ unit.T
             H = _linear((points[view] - middle) @ axes[:2].T, seen[:, :2])
             H = H / np.linalg.norm(H[:, 0])
-            g, h = H[:, 0], H[:, 1]
-            rows += [_of_conic(g, h), _of_conic(g, g) - _of_conic(h, h)]
+            # rows of g' B h and g' B g - h' B h, in B11, B22, B13, B23, B33: the absolute conic's image without skew
+            (g1, g2, g3), (h1, h2, h3) = H[:, 0], H[:, 1]
+            rows.append([g1 * h1, g2 * h2, g1 * h3 + g3 * h1, g2 * h3 + g3 * h2, g3 * h3])
+            rows.append([g1**2 - h1**2, g2**2 - h2**2, 2 * (g1 * g3 - h1 * h3), 2 * (g2 * g3 - h2 * h3), g3**2 - h3**2])
     accepted = (
         f"a table [camera] with fx_px, fy_px, cx_px, cy_px, or {LEAST_VIEWS} views of a flat board from several sides"
     )
@@ -162,11 +164,6 @@ def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
     fx, fy = np.sqrt(squares) / scale
     cx, cy = (np.array([-b13 / b11, -b23 / b22]) - unit[:2, 2]) / scale
     return {"fx": float(fx), "fy": float(fy), "cx": float(cx), "cy": float(cy)}
-
-
-def _of_conic(g: Array, h: Array) -> Array:
-    """Return the row (5,) of g' B h in B11, B22, B13, B23, B33: the image of the absolute conic without skew."""
-    return np.array([g[0] * h[0], g[1] * h[1], g[0] * h[2] + g[2] * h[0], g[1] * h[2] + g[2] * h[1], g[2] * h[2]])
 
 
 def with_poses(data: Dataset, own: Mapping[str, float]) -> Dataset:
