@@ -433,7 +433,8 @@ def accept(
         placed = ro.use.in_session(loaded)
         acceptance = ro.calibration.accept(placed, requirement, read and read.data)
     text = "\n".join([str(acceptance), *ro.use.session_notes(placed)])
-    return Answer(text, acceptance.content(), CODES[acceptance.verdict], read=read)
+    document = {**acceptance.content(), "session": placed.problem.session or None}
+    return Answer(text, document, CODES[acceptance.verdict], read=read)
 
 
 @command

@@ -75,11 +75,12 @@ class Compensation:
     limit), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or ``"near singular"`` (the
     correction would be too large, and was damped); ``"above the limit"`` where the position error and its expanded
     uncertainty (k = 2) together exceed ``limit`` [m]. An ``"ok"`` row is ``"extrapolated"`` beyond the measured joint
-    ranges; ``outside`` are all rows there. ``note`` says why a robot is not delivered, and how joints count whose signs
-    or zeros were estimated; ``point`` which point is moved, and why orientations are not corrected; ``source`` names
-    the calibration. ``beside`` (N,) [m] is how far a stated position is from that of the nominal robot at the joint
-    values stated beside it, NaN where there are none. ``after_motion`` is the RMS of uncorrected position errors [m]
-    that one motion of all targets leaves, NaN for fewer than `MOVED` of them or targets on a line.
+    ranges; ``outside`` are all rows there. ``note`` says why a robot is not delivered, how joints count whose signs or
+    zeros were estimated, and of which session the instrument's frame is; ``point`` which point is moved, and why
+    orientations are not corrected; ``source`` names the calibration. ``beside`` (N,) [m] is how far a stated position
+    is from that of the nominal robot at the joint values stated beside it, NaN where there are none. ``after_motion``
+    is the RMS of uncorrected position errors [m] that one motion of all targets leaves, NaN for fewer than `MOVED` of
+    them or targets on a line.
     """
 
     robot: Robot

@@ -108,6 +108,8 @@ def test_the_commands_that_judge_a_robot_judge_it_in_one_session(
     new = ("--data", str(tmp_path / "new.csv"))
     assert run(monkeypatch, "accept", str(tmp_path), "--limit", "0.5", *new) == 0
     assert "Base in the frame of sessions: " in capsys.readouterr().out
+    assert run(monkeypatch, "accept", str(tmp_path), *new, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["session"] in ("near", "far")
     assert run(monkeypatch, "report", str(tmp_path), *new) == 0
     assert "in the instrument&#39;s frame of session" in (tmp_path / "report.html").read_text()
     assert run(monkeypatch, "validate", str(tmp_path), new[1]) == 0
