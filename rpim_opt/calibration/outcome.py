@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, NoSolutionFound, choices
 from rpim_opt.basics.text import joined, three_digits
 from rpim_opt.bayes.hyperparameters import Learned, sessions_spread
 from rpim_opt.bayes.outliers import by_block, coherent, contradicted, error_vectors
@@ -34,7 +34,7 @@ from rpim_opt.calibration.diagnosis import ActiveBound, Flag, Outside, ShadowPri
 from rpim_opt.calibration.loop import Iteration
 from rpim_opt.convex.constraints import Parsed, name_of
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.program import Program
+from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.quadratic import ridge, ridge_within
 from rpim_opt.convex.robust_loss import inliers_of
 from rpim_opt.convex.select import Selection
@@ -116,22 +116,30 @@ class Outcome:
 
     @cached_property
     def contradiction(self) -> str:
-        """A sentence on constraints that the data contradict; empty where they do not, or the loss is no square.
+        """A sentence on constraints that the data contradict; empty where they do not, or the loss has no squares.
 
         Without constraints the sum of squares falls by chi-square of as many degrees of freedom as are active, if they
-        hold for the robot, times the residuals' variance where that is larger than the noise.
+        hold for the robot, times the residuals' variance where that is larger than the noise. Of a robust loss they
+        are the squares of what it keeps without constraints.
         """
         program, constraints = self.program, self.formulation.constraints
-        if not (constraints and self.formulation.solvable and program.quadratic):
+        if not (constraints and self.formulation.solvable and program.linear_penalty):
             return ""
         tangent = program.tangent(self.z, self.weight)
         if tangent is None:
             return ""
-        free = program.ridge.minima(np.array([self.weight]))[0]
-        held, without = (program.objective(z, self.weight) for z in (self.z, free))
+        bare = pose(replace(program.formulation, constraints=()), program.model)
+        try:
+            best = bare.solve(self.weight).z
+            kept = bare.inlier_model(best)
+        except (InputError, NoSolutionFound):
+            return ""
+        sums = [float(np.sum((kept.A @ z - kept.b) ** 2)) + kept.offset for z in (self.z, best)]
+        penalties = [self.penalty_weight * bare.value(z, self.weight)[1] for z in (self.z, best)]
+        held, without = np.add(sums, penalties).tolist()
         active = len(self.z) - tangent.shape[1]
         variance = max(1.0, without / max(program.model.equations - len(self.z), 1))
-        if chdtrc(active, (held - without) / variance) > CONTRADICTED:
+        if chdtrc(active, max(held - without, 0.0) / variance) > CONTRADICTED:
             return ""
         names = joined([name_of(constraint, k) for k, constraint in enumerate(constraints)])
         return (

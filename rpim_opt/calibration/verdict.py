@@ -13,6 +13,7 @@ from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.exceptions import InputError, NotDelivered
 from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.basics.units import fits
+from rpim_opt.calibration.diagnosis import flagged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.constraints import name_of
 from rpim_opt.data.dataset import Dataset
@@ -484,6 +485,8 @@ def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: 
     if kept.mean() < 1 - EXCLUDED:  # downweighted by a fit that is wrong everywhere
         kept = np.ones_like(kept)
     rows = problem.on(problem.data.take(np.flatnonzero(kept)))
+    outliers = {flag.label for flag in flagged(rows, ridge_deviations(rows))}  # which its loss may hide
+    rows = rows.without(outliers)
     now, plain = (
         max(noise_ratio(rows, rows.errors(x, each), each) for each in UNITS) for x in (result.x, ridge_deviations(rows))
     )

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cvxpy as cp
 import numpy as np
 import pytest
 from scipy.special import fdtri
@@ -275,7 +276,8 @@ def test_a_penalty_without_covariance_has_no_bound(instance) -> None:
     assert any("No bound" in reason for reason in found.reasons)
 
 
-def test_a_drawing_that_the_data_contradict_accepts_no_robot(instance) -> None:
+@pytest.mark.parametrize("loss", [ro.tikhonov.loss, lambda v: cp.sum(cp.huber(v, 2))], ids=["squares", "Huber"])
+def test_a_drawing_that_the_data_contradict_accepts_no_robot(instance, loss) -> None:
     """Intervals are conditional on it: small, whatever it says."""
     names = instance.problem.parameters.free.names
     free = ro.calibrate(instance.problem)
@@ -284,7 +286,7 @@ def test_a_drawing_that_the_data_contradict_accepts_no_robot(instance) -> None:
     for sigmas, contradicted in ((2.0, False), (12.0, True)):
         value = 1e3 * (free.problem.parameters.free.nominal[k] + free.x[k] + sigmas * sd)
         limits = (ro.constraints.parse(f"d4 <= {value - 2e3 * sigmas * sd:.6f} mm"),)
-        stated = ro.Formulation("stated", penalty=ro.tikhonov.penalty, constraints=limits)
+        stated = ro.Formulation("stated", loss, ro.tikhonov.penalty, limits)
         result = ro.calibrate(instance.problem, stated)
         assert bool(result.contradiction) == contradicted
         assert ("The data contradict constraints" in str(result)) == contradicted
