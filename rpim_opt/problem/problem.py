@@ -623,16 +623,6 @@ def near_parallel(robot: Robot) -> tuple[str, ...]:
     )
 
 
-def _depends_on(base: list[str], robot: Robot, parameters: Parameters, data: Dataset) -> bool:
-    """Return whether measurements of a user's type depend on the base: distances do not, a fixture is placed by it."""
-    if any(b.measurement.points > 1 or b.measurement.start or b.measurement.touching for b in data.blocks):
-        return False
-    problem = CalibrationProblem(robot, parameters.identify([*base, "tool_*"]), data)
-    slopes = np.abs(problem.linearize(np.zeros(len(problem.parameters.free))).A)
-    of_base = np.isin(problem.parameters.free.names, base)
-    return bool(slopes[:, of_base].max() > RANK_TOLERANCE * slopes.max())
-
-
 def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, data: Dataset) -> Iterable[str]:
     """Return patterns of parameters; ``"auto"``: geometry, beta where it is needed, frames, own parameters of types."""
     if patterns != "auto":
@@ -649,6 +639,13 @@ def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, 
     names = [name for name in parameters.names if geometry.fullmatch(name)]
     names += near_parallel(robot)
     base = [name for name in parameters.names if name.startswith("base_")]
-    if any(kind.registers for kind in kinds) or (base and _depends_on(base, robot, parameters, data)):
+    placed = any(kind.registers for kind in kinds)
+    # a user's type may depend on the base: distances do not, a fixture is placed by it
+    if base and not placed and not any(kind.points > 1 or kind.start or kind.touching for kind in kinds):
+        problem = CalibrationProblem(robot, parameters.identify([*base, "tool_*"]), data)
+        slopes = np.abs(problem.linearize(np.zeros(len(problem.parameters.free))).A)
+        of_base = np.isin(problem.parameters.free.names, base)
+        placed = bool(slopes[:, of_base].max() > RANK_TOLERANCE * slopes.max())
+    if placed:
         names += base
     return names + [name for name in parameters.names if tools.fullmatch(name) or name in own]

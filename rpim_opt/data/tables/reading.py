@@ -86,24 +86,19 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         raise InputError("the header", ", ".join(table), accepted)
     point = texts(table[naming[0]], naming[0]) if naming else ()
     session = texts(table.get("session", ()), "session")
-    stated |= {"marker": _markers(table, kind, q, label), "fixture": texts(table.get("fixture", ()), "fixture")}
+    first = texts(table.get("marker", ("",) * N), "marker")
+    markers = [first, texts(table.get("to_marker", first), "to_marker")][: kind.points]
+    for i in range(N if kind.points == 2 else 0):
+        if markers[0][i] == markers[1][i] and np.array_equal(q[i, 0], q[i, 1]):
+            found = "the same reflector twice in one configuration"
+            raise InputError(f"row {label[i]}", found, "to_marker or to_q1, ... of another point")
+    marker = np.column_stack(markers) if {"marker", "to_marker"} & set(table) else ()
+    stated |= {"marker": marker, "fixture": texts(table.get("fixture", ()), "fixture")}
     data = Dataset.of(q, y, noise, label, kind, columns=further, session=session, point=point, **stated)
     # as stated, or rows of equal joint values are one
     stops = np.array(texts(table["configuration"], "configuration")) if "configuration" in table else q.reshape(N, -1)
     data = replace(data, configuration=np.unique(stops, axis=0, return_inverse=True)[1].reshape(-1))
     return data.grouped_by_points() if kind.touching else data
-
-
-def _markers(table: Columns, kind: Measurement, q: Array, label: Sequence[str]) -> np.ndarray | tuple[()]:
-    """Return the names (N, p) of the reflectors at the joint values q (N, p, dof), or none."""
-    first = texts(table.get("marker", ("",) * len(label)), "marker")
-    markers = [first, texts(table.get("to_marker", first), "to_marker")][: kind.points]
-    if kind.points == 2:
-        for i, name in enumerate(label):
-            if markers[0][i] == markers[1][i] and np.array_equal(q[i, 0], q[i, 1]):
-                found = "the same reflector twice in one configuration"
-                raise InputError(f"row {name}", found, "to_marker or to_q1, ... of another point")
-    return np.column_stack(markers) if {"marker", "to_marker"} & set(table) else ()
 
 
 def _beside_each_other(columns: Numbers, stems: Sequence[str], N: int) -> Array:
