@@ -148,22 +148,19 @@ def _read(data: Sequence[Any], options: TableOptions) -> Files:
     """Return the tables of sources, each once; of workbooks and texts a stated sheet is the workbooks'."""
     once = {str(each) if isinstance(each, str | Path) else id(each): each for each in data}
     books = {key for key in once if Path(str(key)).suffix.lower() in EXCEL}
-    of_text = replace(options, sheet="") if books else options
-    own = [(source, options if key in books else of_text) for key, source in once.items()]
-    return [each for source, stated in own for each in _sheets(source, stated)]
-
-
-def _sheets(source: Any, options: TableOptions) -> Files:
-    """Return the tables of a source: of the sheet that is called as stated, commas and all, or of several."""
-    if not isinstance(source, str | Path):
-        return [(None, RawTable(read_columns(source)))]
-    path = Path(source)
-    try:
-        return [(path, read_raw(path, replace(options, sheet=options.sheet.strip())))]
-    except InputError as error:
-        if error.where != "--sheet" or "," not in options.sheet:
-            raise
-    return [(path, read_raw(path, replace(options, sheet=sheet.strip()))) for sheet in options.sheet.split(",")]
+    tables: list[tuple[Path | None, RawTable]] = []
+    for key, source in once.items():
+        if not isinstance(source, str | Path):
+            tables.append((None, RawTable(read_columns(source))))
+            continue
+        path, sheet = Path(source), options.sheet if key in books or not books else ""
+        try:
+            tables.append((path, read_raw(path, replace(options, sheet=sheet.strip()))))
+        except InputError as error:  # no sheet that is called as stated, commas and all: several
+            if error.where != "--sheet" or "," not in sheet:
+                raise
+            tables += [(path, read_raw(path, replace(options, sheet=each.strip()))) for each in sheet.split(",")]
+    return tables
 
 
 def _upright(raw: RawTable, arm: RobotSetup) -> RawTable:
