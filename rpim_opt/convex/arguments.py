@@ -76,13 +76,15 @@ class Arguments(Identified):
         """Deviations [SI] by name, as expressions of z."""
         return Deviations(self.z, self)
 
-    def positions(self, q: Array, marker: str | None = None, torque: Array | None = None) -> cp.Expression:
+    def positions(
+        self, q: Array, marker: str | None = None, torque: Array | None = None, robot: str = ""
+    ) -> cp.Expression:
         """Return predicted positions (N, 3) [m] in the instrument's frame, affine in z.
 
         To first order about the solution: a calibration is repeated about what it found until that is so. q (N, dof)
         are joint values of the controller [rad or m]; ``marker`` is the reflector, the only one by default
         (InputError where there are several); ``torque`` (N, dof) joint torques [Nm], where compliance is identified
-        from measured ones.
+        from measured ones; ``robot`` one of several.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -94,10 +96,10 @@ class Arguments(Identified):
         0.1975 m
         """
         problem = problem_of(self)
-        known = markers(problem)
+        known = markers(problem.alone(robot))
         if marker is None and len(known) > 1:
             raise InputError("positions", f"no marker, of {len(known)} reflectors", f"marker = one of {joined(known)}")
-        prediction = predicted(problem, q, marker, torque, self.at)
+        prediction = predicted(problem, q, known[0] if marker is None else marker, torque, self.at, robot)
         count = len(prediction.position)
         flat = (prediction.slope * self.scale).reshape(3 * count, -1)
         return cp.reshape(flat @ self.z, (count, 3), order="C") + prediction.position

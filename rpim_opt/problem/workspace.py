@@ -36,10 +36,15 @@ class Predicted(NamedTuple):
 
 
 def predicted(
-    problem: CalibrationProblem, q: Array, marker: str | None, torque: Array | None = None, at: Array | None = None
+    problem: CalibrationProblem,
+    q: Array,
+    marker: str | None,
+    torque: Array | None = None,
+    at: Array | None = None,
+    robot: str = "",
 ) -> Predicted:
     """Return where a reflector is at q (N, dof) [rad or m] to first order about ``at`` (n,) [SI]; torques [Nm]."""
-    here = problem.measuring(q, position, marker, torque)
+    here = problem.measuring(q, position, marker, torque, robot=robot)
     x = np.zeros(len(problem.parameters.free)) if at is None else at
     places = here.modelled(x)[0]
     slope = here.jacobian(x).reshape(len(places), 3, -1)

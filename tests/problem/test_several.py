@@ -173,6 +173,23 @@ def test_a_constraint_ties_parameters_of_two_robots() -> None:
     assert values["left.a2"] == pytest.approx(values["right.a2"], abs=1e-9)
 
 
+def test_a_constraint_bounds_positions_of_one_of_two_robots() -> None:
+    left, right, _ = two(counts=(30, 30))
+    whole = ro.together(left=left, right=right, shared=TOOL)
+    q = np.full((1, 5), 0.3)
+    height = ro.calibrate(whole, ro.tikhonov, weight=1.0).forward(q, robot="right")[0, 2, 3] + 1e-3
+
+    def stated(robot: str) -> ro.Formulation:
+        return ro.Formulation(
+            "stated", penalty=cp.sum_squares, constraints=(lambda z, p: p.positions(q, robot=robot)[0, 2] == height,)
+        )
+
+    found = ro.calibrate(whole, stated("right"), weight=1.0)
+    assert found.forward(q, robot="right")[0, 2, 3] == pytest.approx(height, abs=1e-7)
+    with pytest.raises(ro.InputError, match="left"):
+        ro.calibrate(whole, stated(""), weight=1.0)
+
+
 def test_a_frame_that_was_stated_far_off_is_found_for_every_robot() -> None:
     left, right, _ = two(counts=(30, 30))
     whole = ro.together(left=left, right=right, shared=TOOL)
