@@ -445,5 +445,5 @@ def content_hash(thing: Any, where: str) -> str:
             return str(Hasher("sha256").hash(thing))
         found = "a function of an interactive session"
     except Exception as error:  # of any library's own making
-        found = f"something that cannot be pickled ({error})"
+        found = f"something that cannot be pickled ({(*error.args, error)[0]})"  # joblib adds the whole thing
     raise InputError(where, found, "what can be pickled, with functions of a file by their names; or no journal")
