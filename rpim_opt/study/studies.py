@@ -432,18 +432,20 @@ def content_hash(thing: Any, where: str) -> str:
     a lambda or a generator, and for functions of an interactive session, which has no file.
     """
 
-    class Hasher(library("joblib.hashing", where, "studies").NumpyHasher):
-        def reducer_override(self, obj: Any) -> Any:
-            own = type(obj).__module__.startswith("rpim_opt.") and type(obj).__reduce__ is object.__reduce__
-            if own and is_dataclass(obj) and not isinstance(obj, type):  # without what it cached
-                return type(obj), tuple(getattr(obj, each.name) for each in fields(obj))
-            return NotImplemented
+    def reduced(pickler: Any, obj: Any) -> Any:
+        own = type(obj).__module__.startswith("rpim_opt.") and type(obj).__reduce__ is object.__reduce__
+        if own and is_dataclass(obj) and not isinstance(obj, type):  # without what it cached
+            return type(obj), tuple(getattr(obj, each.name) for each in fields(obj))
+        return NotImplemented
 
+    hasher = library("joblib.hashing", where, "studies").NumpyHasher
+    whole = io.BytesIO()
     try:
-        session = not hasattr(sys.modules["__main__"], "__file__")
-        if not (session and b"__main__" in pickle.dumps(thing)):
-            return str(Hasher("sha256").hash(thing))
+        # first, because joblib passes over what it cannot pickle inside a mapping
+        type("Whole", (pickle.Pickler,), {"reducer_override": reduced})(whole).dump(thing)
+        if hasattr(sys.modules["__main__"], "__file__") or b"__main__" not in whole.getvalue():
+            return str(type("Hasher", (hasher,), {"reducer_override": reduced})("sha256").hash(thing))
         found = "a function of an interactive session"
     except Exception as error:  # of any library's own making
-        found = f"something that cannot be pickled ({(*error.args, error)[0]})"  # joblib adds the whole thing
+        found = f"something that cannot be pickled ({error})"
     raise InputError(where, found, "what can be pickled, with functions of a file by their names; or no journal")
