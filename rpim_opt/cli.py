@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
 from importlib import import_module
+from importlib.metadata import entry_points
 from inspect import Parameter, signature
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -35,15 +36,32 @@ inconclusive: acceptance, or an uncertainty above the nominal robot's error.
 """
 
 
+OTHERS = "rpim_opt.commands"  # entry points that are commands of other packages
 VALUES = {"Path": "PATH", "int": "INTEGER", "float": "NUMBER"}
 """What help calls the values of options, by their types; others are TEXT."""
+PLAIN: Any = {"rich_markup_mode": None, "pretty_exceptions_enable": False}
 
 
 class Commands(TyperGroup):
-    """The commands; arguments and the values of options are in capitals, in place of Python's types."""
+    """The commands of this package, then those of other packages, which are loaded at first use.
+
+    Arguments and the values of options are in capitals, in place of Python's types.
+    """
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the commands; of two with one name that of this package."""
+        return list(dict.fromkeys([*super().list_commands(ctx), *sorted(entry_points(group=OTHERS).names)]))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command of a name."""
+        """Return the command of a name; one that cannot be loaded reports that when it is called."""
+        others = () if cmd_name in self.commands else entry_points(group=OTHERS, name=cmd_name)
+        for each in others:
+            alone = typer.Typer(add_completion=False, **PLAIN)
+            try:
+                _add(alone, cmd_name, each.load())
+            except Exception as error:  # code of somebody else may raise anything
+                _add(alone, cmd_name, _failing(f"cannot be loaded: {str(error) or type(error).__name__}"))
+            self.commands[cmd_name] = typer.main.get_command(alone)
         command: Any = super().get_command(ctx, cmd_name)
         if command is None:
             return None
@@ -58,7 +76,20 @@ class Commands(TyperGroup):
         return command
 
 
-app = typer.Typer(cls=Commands, no_args_is_help=True, help=HELP, rich_markup_mode=None, pretty_exceptions_enable=False)
+def _add(to: typer.Typer, name: str, function: Callable[..., Any]) -> None:
+    """Add a command, which the list of commands shows with the whole first line of its docstring."""
+    to.command(name, short_help=(function.__doc__ or "").partition("\n\n")[0])(function)
+
+
+def _failing(text: str) -> Callable[[], None]:
+    def fail() -> None:
+        raise RpimError(f"The command {text}.")
+
+    fail.__doc__ = text
+    return fail
+
+
+app = typer.Typer(cls=Commands, no_args_is_help=True, help=HELP, **PLAIN)
 # click's, or typer's own copy, depending on typer's version
 USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 INTERRUPTED = 130
@@ -116,6 +147,7 @@ ROTATION = "Meaning of rx, ry, rz: 'extrinsic xyz' (default), 'intrinsic zyx', v
 Tolerance = Annotated[Number, Option(help="Acceptance tolerance [mm]: exit code 1 if rejected, 4 if inconclusive.")]
 Register = Annotated[bool, Option("--register", help="The instrument was moved: register it again before judging.")]
 Box = Annotated[Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's base; default: measured joint ranges.")]
+Measured = Annotated[Choice, Option("--measured/--region", help="Judge measured configurations, or all of the region.")]
 Marker = Annotated[Text, Option(help="Name of the reflector, if there are several.")]
 UrdfBase = Annotated[Text, Option(help="Base link of the chain; default: the root of the URDF.")]
 UrdfTip = Annotated[Text, Option(help="Tip link of the chain, if there are several.")]
@@ -229,8 +261,7 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
             raise typer.Exit(answer.code)
 
     vars(run)["__signature__"] = signature(run).replace(parameters=options)
-    # the list of commands shows the whole first line of the docstring
-    app.command(function.__name__, short_help=(function.__doc__ or "").partition("\n\n")[0])(run)
+    _add(app, function.__name__, run)
     return function
 
 
@@ -303,6 +334,7 @@ def calibrate(
     use_validation: Annotated[Choice, Option(help="Refit with validation rows too; default: if held out.")] = None,
     limit: Tolerance = None,
     box: Box = None,
+    measured: Measured = None,
     out: Folder = None,
 ) -> Answer:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
@@ -317,7 +349,7 @@ def calibrate(
 
         say("reading the problem")
         instance = ro.load(problem, variant)
-        requirement = console.requirement_of(limit, box, instance.record.requirement)
+        requirement = console.requirement_of(limit, box, measured, instance.record.requirement)
         instance = replace(instance, record=replace(instance.record, requirement=requirement))
         words = {"model": model, "noise": noise, "formulation": formulation}
         changes: dict[str, Any] = {key: word for key, word in words.items() if word}
@@ -415,6 +447,7 @@ def accept(
     result: Result,
     limit: Tolerance = None,
     box: Box = None,
+    measured: Measured = None,
     data: Annotated[list[Path] | None, Option(help=f"New measurements, instead of the result's; {Several}")] = None,
     tables: Tables = TABLES,
     measurement: Kind = None,
@@ -429,7 +462,7 @@ def accept(
         options = loaded, data, measurement, tables.options, register
         read = ro.use.read_measurements(*options) if data else None
         say("searching for the maximum uncertainty")
-        requirement = console.requirement_of(limit, box, loaded.record.requirement)
+        requirement = console.requirement_of(limit, box, measured, loaded.record.requirement)
         placed = ro.use.in_session(loaded)
         acceptance = ro.calibration.accept(placed, requirement, read and read.data)
     text = "\n".join([str(acceptance), *ro.use.session_notes(placed)])

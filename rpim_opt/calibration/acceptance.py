@@ -53,11 +53,15 @@ ANYWHERE = Requirement(limit=1.0)  # the region of a result without requirement:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Region of a requirement: a problem with its joint limits, a box (3, 2) [m] in the base frame, and a reflector."""
+    """Region of a requirement: a problem with its joint limits, a box (3, 2) [m] in the base frame, and a reflector.
+
+    Where only what was ``measured`` is required, these configurations (N, dof).
+    """
 
     problem: CalibrationProblem
     box: Array | None
     marker: str
+    measured: Array | None = None
 
     @property
     def limits(self) -> Array:
@@ -84,7 +88,11 @@ class Region:
 
     def samples(self) -> Array:
         """Return configurations (N, dof) that represent the region; InputError if none reaches the box."""
-        return within(self.problem, self.box, self.marker)
+        if self.measured is None:
+            return within(self.problem, self.box, self.marker)
+        if not self.inside(self.measured).any():
+            raise InputError("acceptance", "no measured configuration in the region", "a region that holds some")
+        return self.measured[self.inside(self.measured)]
 
 
 def region_of(result: Outcome, requirement: Requirement) -> Region:
@@ -104,7 +112,13 @@ def region_of(result: Outcome, requirement: Requirement) -> Region:
     if marker not in known:
         raise InputError("acceptance", f"reflector '{marker}'", ", ".join(known))
     limited = replace(sample, robots=replace(problem.robot, limits=limits))
-    return Region(limited, None if requirement.box is None else np.array(requirement.box), marker)
+    measured = _measured(result) if requirement.measured else None
+    return Region(limited, None if requirement.box is None else np.array(requirement.box), marker, measured)
+
+
+def _measured(result: Outcome) -> Array:
+    """Return the configurations (N, dof) of the identification rows, at most `MEASURED` of a block."""
+    return np.concatenate([b.q[:MEASURED, 0] for part in result.problem.rows() for b in part.data.blocks])
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,11 +154,11 @@ class Workspace:
         """Maximum and median in words."""
         name = self.requirement.marker
         reflector = f"reflector '{name}'" if name else "the reflector"
+        found = "measured configurations" if self.requirement.measured else "configurations, refined by a search"
         return (
             f"Expanded uncertainty of the position that {reflector} reaches (U, "
             f"{percent(self.requirement.confidence)}): at most {1e3 * self.largest:.3f} mm (largest of {self.count} "
-            f"configurations, refined by a search), median {1e3 * self.median:.3f} mm; `compensate --tool` states that "
-            "of another point"
+            f"{found}), median {1e3 * self.median:.3f} mm; `compensate --tool` states that of another point"
         )
 
 
@@ -153,7 +167,7 @@ def workspace(result: Outcome, requirement: Requirement, region: Region, drawn: 
     rng = np.random.default_rng(0)
     span = np.ptp(region.limits, axis=1)
     q, bound = drawn, reached_positions(result, region, drawn, requirement.confidence)[1]
-    for step in STEPS:
+    for step in STEPS if region.measured is None else ():
         beside = q[np.argsort(-bound)[:WORST]].repeat(BESIDE, axis=0)
         beside = np.clip(beside + step * span * rng.normal(size=beside.shape), *region.limits.T)
         beside = beside[region.inside(beside)]
@@ -213,7 +227,7 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
         "Measure more configurations (`rpim-opt design --augment`), with larger wrist rotations, or state what is "
         'known of the reflector ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]).'
     )
-    if any(map(of_session, result.problem.parameters.free.names)):
+    if any(map(of_session, result.problem.parameters.free.names)) and not result.problem.session:
         advice = _missing(result, nominal, found, 0.0)
     return (
         f"Inconclusive: the median U over the region, {1e3 * found.median:.3f} mm, is above the error of the "
@@ -375,7 +389,7 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
             f"Missing: a tighter bound on repeatability, which may contribute {1e3 * repeatability:.3f} mm. Approach "
             "some poses repeatedly (`rpim-opt iso9283`)."
         )
-    if any(map(of_session, result.problem.parameters.free.names)):
+    if any(map(of_session, result.problem.parameters.free.names)) and not result.problem.session:
         return (
             "Missing: one registration for all sessions, to the same reference points. The bound of "
             f"{1e3 * bound:.3f} mm includes session offsets, which more configurations do not reduce."
@@ -387,11 +401,10 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
             f"reduce the bound of {1e3 * bound:.3f} mm. Survey the base or the anchor, and state the result in [prior] "
             '(known = ["anchor_x = 900 +- 0.05 mm", ...]).'
         )
-    q = np.concatenate([b.q[:MEASURED, 0] for part in result.problem.rows() for b in part.data.blocks])
-    measured = reached_positions(result, found.region, q, found.requirement.confidence)[1].max()
+    measured = reached_positions(result, found.region, _measured(result), found.requirement.confidence)[1].max()
     apart = ""
     if measured < bound / 2:
-        apart = f", at measured configurations {1e3 * measured:.3f} mm (--box restricts the region)"
+        apart = f", at measured configurations {1e3 * measured:.3f} mm (--measured asks for these, --box for a part)"
     return (
         f"Missing: more measurements. The bound is {1e3 * bound:.3f} mm{apart}; with all parameters known the robot's "
         f"repeatability would still contribute {1e3 * repeatability:.3f} mm. `rpim-opt design --augment` names the "

@@ -9,7 +9,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.text import joined, listed, table
-from rpim_opt.basics.units import display
+from rpim_opt.basics.units import display, printed
 from rpim_opt.bayes.hyperparameters import Learned, Size
 from rpim_opt.bayes.prior import BASE, SESSIONS
 from rpim_opt.calibration.outcome import Outcome
@@ -70,7 +70,7 @@ def columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
             figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
             std = "-" if row["std"] is None else f"{row['std']:.4f}"
             name = f"{row['parameter']} *" if rotated(row) else row["parameter"]
-            cells.append([name, row["unit"], *figures, std])
+            cells.append([name, printed(row["unit"]), *figures, std])
     return ["parameter", "unit", "nominal", "identified", "deviation", "std"], cells
 
 

@@ -80,6 +80,11 @@ class Expressions:
         instead: dict[int, Any] = {}
         if formulation.penalty_over is not None:
             self.differences = [np.asarray(D, dtype=float) for D in formulation.penalty_over(parameters)]
+            n = len(parameters)
+            for D in self.differences:
+                if D.shape[1:] != (n,):
+                    accepted = f"matrices of shape (k, {n}): a column for each identified parameter"
+                    raise InputError("penalty_over", f"a matrix of shape {D.shape}", accepted)
             penalized = cp.Variable(len(self.differences))
             instead = {id(penalized): cp.hstack([cp.norm(D @ z) for D in self.differences])}
         frozen = Frozen([z, r, seen, penalized], where)

@@ -26,7 +26,8 @@ class Requirement:
     The ``limit`` bounds the distance between the position reached and the one that the model predicts [m], kept
     with probability ``confidence`` at every configuration of the region: the nominal reflector in a ``box``, sides
     (low, high) along x, y, z [m] in the robot's base frame, anywhere by default; ``joints`` within sides (low, high)
-    [rad or m], by their number from 1, the others within what was measured. ``marker`` is the reflector; the only one,
+    [rad or m], by their number from 1, the others within what was measured; ``measured``: at the configurations there
+    that were measured alone, and nothing between. ``marker`` is the reflector; the only one,
     or the first, by default. InputError for a limit or a confidence that nothing can keep, and sides that are not
     (low, high).
 
@@ -40,6 +41,7 @@ class Requirement:
     joints: tuple[tuple[int, Side], ...] = ()
     marker: str = ""
     confidence: float = CONFIDENCE
+    measured: bool = False
 
     def __post_init__(self) -> None:
         if not 0 < self.limit < float("inf"):
@@ -55,10 +57,10 @@ class Requirement:
     @property
     def where(self) -> str:
         """The region as text."""
-        box = ""
+        box = "the measured configurations alone, " if self.measured else ""
         if self.box is not None:
             sides = [f"{axis} {1e3 * a:g} to {1e3 * b:g}" for axis, (a, b) in zip("xyz", self.box, strict=True)]
-            box = f"the box {', '.join(sides)} mm of the base frame, "
+            box += f"the box {', '.join(sides)} mm of the base frame, "
         if not self.joints:
             return f"{box}joints within the measured ranges"
         limited = ", ".join(str(joint) for joint, _ in self.joints)

@@ -134,8 +134,10 @@ def payload_of(text: str | None) -> tuple[float | None, list[float] | None]:
     return mass, [1e-3 * v for v in centre] or None
 
 
-def requirement_of(limit: float | None, box: str | None, stated: Requirement | None) -> Requirement | None:
-    """Return the requirement of ``--limit`` [mm] and ``--box``, which override those of the problem or result."""
+def requirement_of(
+    limit: float | None, box: str | None, measured: bool | None, stated: Requirement | None
+) -> Requirement | None:
+    """Return the requirement of ``--limit`` [mm], ``--box`` and ``--measured``, which override the stated one's."""
     from rpim_opt.data.record import Requirement
 
     require_positive("--limit", limit)
@@ -145,9 +147,11 @@ def requirement_of(limit: float | None, box: str | None, stated: Requirement | N
     if box is not None:
         ends = [1e-3 * end for end in _numbers("--box", box, (6,), "six numbers: x0,x1,y0,y1,z0,z1 [mm]")]
         changes["box"] = tuple(zip(ends[::2], ends[1::2], strict=True))
+    if measured is not None:
+        changes["measured"] = measured
     if stated is not None:
         return replace(stated, **changes)
-    return Requirement(**changes) if changes else None
+    return Requirement(**changes) if limit is not None else None
 
 
 def listed_words(text: str) -> list[str]:

@@ -525,6 +525,7 @@ def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requi
     known = dict.fromkeys(BOX, ("length",)) | joints
     fields: dict[str, Any] = {name: (Annotated[pair, dimension], None) for name, (dimension,) in known.items()}
     fields |= {"limit": (Length, ...), "confidence": (float, CONFIDENCE), "marker": (str, "")}
+    fields["measured"] = (bool, False)
     schema: type[Table] = create_model("Acceptance", __base__=Table, **fields)
     keys = dict(validate(schema, table, path, "acceptance"))
     sides = {name: (keys[name][0], keys[name][1]) for name in known if keys[name] is not None}
@@ -534,7 +535,7 @@ def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requi
     box = (sides["x"], sides["y"], sides["z"]) if axes else None
     ranges = tuple((int(name[1:]), side) for name, side in sides.items() if name not in BOX)
     with at_key("acceptance", path, part=True):
-        return Requirement(keys["limit"], box, ranges, keys["marker"], keys["confidence"])
+        return Requirement(keys["limit"], box, ranges, keys["marker"], keys["confidence"], keys["measured"])
 
 
 def place_fixtures(placed: Mapping[str, Any], data: Dataset) -> dict[str, float]:

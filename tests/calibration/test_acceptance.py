@@ -100,6 +100,24 @@ def test_a_region_is_where_it_says_and_its_largest_bound_is_searched_for(result)
     assert found.workspace.median == pytest.approx(np.median(bound))
 
 
+def test_measured_configurations_alone_may_be_required(result, monkeypatch, capsys, tmp_path) -> None:
+    """Their bound is the largest at them, without a search between: no larger than that of the whole region."""
+    whole = accept(result, Requirement(1e-3))
+    alone = accept(result, Requirement(1e-3, measured=True))
+    q = result.problem.data.q
+    assert alone.workspace is not None
+    assert whole.bound is not None
+    assert alone.workspace.count == len(q)
+    assert (alone.workspace.q[:, None] == q).all(axis=2).any(axis=1).all()
+    assert alone.bound is not None
+    assert alone.bound <= whole.bound
+    ro.store.save_result(result, tmp_path)
+    limit = f"{1e3 * (alone.bound + whole.bound) / 2}"
+    assert run(monkeypatch, "accept", str(tmp_path), "--limit", limit) == 4
+    assert run(monkeypatch, "accept", str(tmp_path), "--limit", limit, "--measured") == 0
+    assert "Region: the measured configurations alone" in capsys.readouterr().out
+
+
 def test_what_no_region_can_be_is_refused(result) -> None:
     with pytest.raises(ro.InputError, match="within reach, in the robot's base frame"):
         accept(result, Requirement(1e-4, box=((9.0, 9.1), (0.0, 1.0), (0.0, 1.0))))
@@ -146,7 +164,7 @@ def test_joints_that_were_moved_together_do_not_bound_other_combinations() -> No
     found = ro.calibration.accept(moved_together, ro.data.Requirement(1e-4))
     assert found.verdict == "inconclusive"
     measured = reached_positions(moved_together, region_of(moved_together, found.requirement), q, 0.95)[1].max()
-    assert f", at measured configurations {1e3 * measured:.3f} mm (--box restricts the region)" in str(found)
+    assert f", at measured configurations {1e3 * measured:.3f} mm (--measured asks for these" in str(found)
     assert found.bound is not None
     assert found.bound > 2 * measured
 

@@ -106,3 +106,11 @@ def test_one_constraint_may_stand_alone() -> None:
     alone = ro.Formulation("own", constraints=ro.constraints.at_nominal("a3"))
     assert alone.constraints == ro.Formulation("own", constraints=[ro.constraints.at_nominal("a3")]).constraints
     assert "1 constraint" in repr(alone)
+
+
+def test_groups_of_another_width_are_refused_with_the_accepted_one() -> None:
+    problem = ro.load("paper_arm").problem
+    n = len(problem.parameters.free)
+    narrow = ro.Formulation("mine", penalty=cp.sum, penalty_over=lambda parameters: [np.eye(n - 1)])
+    with pytest.raises(ro.InputError, match=rf"penalty_over: found a matrix of shape .*{n - 1}.*\(k, {n}\)"):
+        ro.calibrate(problem, narrow, 1.0)
