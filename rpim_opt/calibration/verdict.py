@@ -485,8 +485,8 @@ def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: 
     if kept.mean() < 1 - EXCLUDED:  # downweighted by a fit that is wrong everywhere
         kept = np.ones_like(kept)
     rows = problem.on(problem.data.take(np.flatnonzero(kept)))
-    outliers = {flag.label for flag in flagged(rows, ridge_deviations(rows))}  # which its loss may hide
-    rows = rows.without(outliers)
+    if not result.squared_loss:  # which would be biased by outliers, not by the formulation
+        rows = rows.without({flag.label for flag in flagged(rows, ridge_deviations(rows))})
     now, plain = (
         max(noise_ratio(rows, rows.errors(x, each), each) for each in UNITS) for x in (result.x, ridge_deviations(rows))
     )
