@@ -10,6 +10,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.held_out import registered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_session, session_prefix
@@ -62,10 +63,15 @@ def _slopes(view: Calibration, robot: str) -> Array:
     """Return the derivatives (N, 3, n) of positions in the frame of a view's session at measured configurations."""
     problem = view.problem.sample()
     blocks = [block for block in problem.data.blocks if block.robot == robot]
-    q = np.concatenate([block.q[:, 0] for block in blocks])
-    q = q[:: -(-len(q) // SOME)]
-    there = problem.measuring(q, marker=blocks[0].markers[0], robot=robot)
-    return there.jacobian(view.x).reshape(len(q), 3, -1)
+    few = slice(None, None, -(-sum(len(block.row) for block in blocks) // SOME))
+    slopes = []
+    for block in blocks:
+        torque = None if block.torque is None else block.torque[few, 0]
+        payload = None if block.payload is None else block.payload[few]
+        columns = {name: values[few] for name, values in block.columns.items()}
+        there = problem.measuring(block.q[few, 0], position, block.markers[0], torque, payload, columns, robot)
+        slopes.append(there.jacobian(view.x).reshape(len(there.data), 3, -1))
+    return np.concatenate(slopes)
 
 
 def base_frame(result: Calibration, robot: str, session: str = "") -> Array:

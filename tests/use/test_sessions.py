@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from rpim_opt.calibration.acceptance import measured_workspace
 from rpim_opt.robot.kinematics import numeric_frame
 from rpim_opt.robot.parameters import model_parameters
 from rpim_opt.study.arms import BASE, KINDS, SCALES, TOOL
+from tests import ROOT
 from tests.test_cli import run
 
 NOISE = 3e-5
@@ -131,3 +133,18 @@ def test_measurements_from_a_third_place_are_judged_by_the_robots_uncertainty_on
     found = ro.use.validate(result, ro.Dataset.of(arm.read.q[:40], y, NOISE), register=True)
     assert found.beyond == (7,)
     assert any("Registered again" in remark for remark in found.remarks)
+
+
+def test_joint_torques_go_with_the_configurations(tmp_path: Path) -> None:
+    """Compliances of measured torques bend the arm where it was measured, also when sessions are compared."""
+    shutil.copytree(ROOT / "problems" / "joints", tmp_path, dirs_exist_ok=True)
+    head, *rows = (tmp_path / "identification.csv").read_text().splitlines()
+    half = len(rows) // 2
+    rows = [f"{row},{'first' if k < half else 'second'}" for k, row in enumerate(rows)]
+    (tmp_path / "identification.csv").write_text("\n".join([f"{head},session", *rows]))
+    text = (tmp_path / "problem.toml").read_text()
+    (tmp_path / "problem.toml").write_text(text.replace("identify = [", 'identify = ["session_*", ', 1))
+    result = ro.calibrate(tmp_path, "tikhonov", 1.0)
+    notes = ro.use.session_notes(ro.use.in_session(result))
+    assert "'first'" in notes[0]
+    assert "'second'" in notes[0]
