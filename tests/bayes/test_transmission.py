@@ -186,7 +186,7 @@ def test_corrections_are_a_table(rippled, tmp_path):
     assert said[-1] in lines[0][4]
     assert "with this geometry" not in lines[0][4]
     assert np.abs(table[:, 1]).max() <= np.degrees(1.0)  # no rows beyond the measured angles
-    assert "reached with this geometry (U, 95 %): at most " in " ".join(said)
+    assert "reaches with this geometry (U, 95 %): at most " in " ".join(said)
     assert "Acceptance" not in " ".join(said)
     required = dataclasses.replace(result.record, requirement=ro.data.Requirement(limit=1e-6))
     doubtful = ro.use.export_files(dataclasses.replace(result, record=required), mdh=tmp_path / "arm.csv")
