@@ -807,7 +807,8 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
         cause = "did the joint slip or fall back under its load, or was it remastered"
         by = shares | (_shares(problem, i) if along_joints else {})
         yield from _changes(whole, there, A, [name], f"zero of joint {i + 1}", cause, by)
-    flange = forward_kinematics(replace(problem.robot, joint_map=np.eye(len(problem.robot.mdh))), problem.joint_values)
+    model = replace(problem.robot, joint_map=np.eye(len(problem.robot.mdh)), limits=np.empty((0, 0)))
+    flange = forward_kinematics(model, problem.joint_values)
     down = {
         "with the direction of gravity at the flange": problem.robot.gravity.direction @ flange[problem.owners, :3, :3]
     }

@@ -229,10 +229,12 @@ def test_a_result_of_a_lost_formulation_has_a_report(tmp_path: Path) -> None:
 
 
 def test_the_command(monkeypatch, capsys, arm, arm_page, tmp_path: Path) -> None:
-    """A loaded result has the same page, to the last character."""
+    """A loaded result has the same page, to the last character, but for the digest of its file."""
     ro.store.save_result(arm, tmp_path / "result.json")
     assert run(monkeypatch, "report", str(tmp_path / "result.json"), "--out", str(tmp_path / "b" / "r.html")) == 0
-    assert (tmp_path / "b" / "r.html").read_text(encoding="utf-8") == arm_page
+    digest = ro.load_result(tmp_path / "result.json").record.digest
+    made = (tmp_path / "b" / "r.html").read_text(encoding="utf-8")
+    assert made.replace(f"<div><dt>Digest of the result</dt><dd>{digest}</dd></div>", "") == arm_page
     capsys.readouterr()
     assert run(monkeypatch, "report", str(tmp_path / "nothing.json")) == 2
     said = capsys.readouterr()

@@ -364,12 +364,13 @@ def base_position(result: ro.calibration.Calibration, q: np.ndarray) -> np.ndarr
 
 
 def test_a_row_does_not_depend_on_the_others() -> None:
+    """But for whether orientations are corrected, which is one decision for a table."""
     result, q = limited()
     q[1::3, 4] = 0.0
-    together = ro.use.compensate(result, q)
+    together = ro.use.compensate(result, q, orientation=True)
     assert set(together.status) >= {"ok", "limited", "near singular"}
     for i in range(0, 40, 3):
-        alone = ro.use.compensate(result, q[i : i + 1])
+        alone = ro.use.compensate(result, q[i : i + 1], orientation=True)
         assert alone.q[0] == pytest.approx(together.q[i], abs=1e-11)
         assert alone.status[0] == together.status[i]
         assert alone.std[0] == pytest.approx(together.std[i])
