@@ -81,12 +81,12 @@ def test_code_of_a_folder_runs_only_where_it_is_allowed(folder: Path, monkeypatc
     assert run(monkeypatch, "report", here) == 2
     assert "--allow-code" in capsys.readouterr().err
     assert run(monkeypatch, "report", here, "--allow-code") == 0
-    with pytest.raises(ro.InputError, match="allow-code"):
+    with pytest.raises(ro.InputError, match="allow_code"):
         ro.load(folder)
     with ro.store.allow_code():
         again = ro.load_result(folder)
         assert np.abs(again.x - ro.load(folder).calibrate().x).max() < 1e-12
-    with pytest.raises(ro.InputError, match="allow-code"):
+    with pytest.raises(ro.InputError, match="allow_code"):
         ro.load_result(folder)
 
 
