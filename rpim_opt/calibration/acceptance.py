@@ -280,7 +280,8 @@ class Acceptance:
         requirement = self.requirement
         limit = f"limit {1e3 * requirement.limit:g} mm with {percent(requirement.confidence)} confidence"
         lines = [
-            f"{self.verdict.capitalize()}: {limit} at every configuration of the region.",
+            f"{self.verdict.capitalize()}: {limit} at every {'measured ' * requirement.measured}configuration of the "
+            "region.",
             *self.reasons,
             *filter(None, [self.caution]),
             f"Region: {requirement.where}.",

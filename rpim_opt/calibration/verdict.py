@@ -283,10 +283,12 @@ def _worse(result: Outcome) -> Iterator[str]:
                 "of freedom, and no validation data check it. Measure more configurations."
             )
         return
-    if worse_than_nominal(nominal, identified):
-        yield worse_sentence(nominal, identified)
-    elif rms(result.errors()) < rms(identified) and (moved := implausible(result, identified)):
-        yield moved
+    said = worse_sentence(nominal, identified) if worse_than_nominal(nominal, identified) else ""
+    if not said and rms(result.errors()) < rms(identified):
+        said = implausible(result, identified)
+    if said:
+        read = "" if validation is None or not result.problem.keeps_rows else misread(result, validation)
+        yield f"Held-out rows do not fit. {read}" if read else said
 
 
 def implausible(result: Outcome, error: Array) -> str:

@@ -545,7 +545,7 @@ def other_places(problem: CalibrationProblem) -> Iterator[str]:
         where = _rows(problem.data, points.row[part], "fits", "fit")
         if in_turn:
             where = f"from about row {problem.data.label[points.row[part[0]]]} on the points fit"
-        other, joint = _other_place(points, first, fit)
+        other, joint = _other_place(points, first, fit, len(problem.data.sessions) > 1)
         if in_turn or joint != 1:  # no base moves to and fro about the first axis
             yield f"{where} another {other}."
 
@@ -567,7 +567,7 @@ def _stations(points: Points) -> tuple[list[tuple[np.ndarray, Fit]], np.ndarray,
     return parts, rest, False
 
 
-def _other_place(points: Points, first: Fit, second: Fit) -> tuple[str, int | None]:
+def _other_place(points: Points, first: Fit, second: Fit, sessions: bool) -> tuple[str, int | None]:
     """Return which place of the second fit is another one than in the first, and the joint that may be off instead."""
     reflectors = float(np.linalg.norm(second.tools - first.tools, axis=1).max())
     if points.lengths:
@@ -579,6 +579,9 @@ def _other_place(points: Points, first: Fit, second: Fit) -> tuple[str, int | No
         joint, places = 1, transformed(backs, second.modelled[:, None])
         far = float(np.linalg.norm(places[:, 1] - places[:, 0], axis=1).mean())
         remedy = "calibrate one part, and add the other to its result with `update --reset 'base_*'`"
+        if sessions:  # of one place, unless they are said to be apart
+            remedy = "if it did between sessions, identify `session_*`, with session_mm = 1000 and session_mrad = 1000 "
+            remedy += "in [scale]"
         other, what = "base", f"the instrument or the robot's base moved; {remedy}"
     if reflectors > far:
         far, joint, places = reflectors, len(points.robot.mdh), np.stack([first.tools, second.tools], axis=1)

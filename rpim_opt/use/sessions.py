@@ -52,11 +52,11 @@ def registered_again(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
 
 
 def _sessions(result: Calibration, robot: str) -> list[str]:
-    """Return the names of the sessions that are identified."""
+    """Return the names of the sessions that are identified, of an update those that it measured."""
     free = result.problem.parameters.of_robot(robot).free.names
     called = {session_prefix(name): name for name in result.problem.sample().data.sessions}
     prefixes = dict.fromkeys(frame_of(name) for name in free if of_session(name))
-    return [called.get(prefix, prefix.removeprefix("session_")[:-1]) for prefix in prefixes]
+    return [called[prefix] for prefix in prefixes if prefix in called]
 
 
 def _slopes(view: Calibration, robot: str) -> Array:

@@ -115,7 +115,9 @@ def test_measured_configurations_alone_may_be_required(result, monkeypatch, caps
     limit = f"{1e3 * (alone.bound + whole.bound) / 2}"
     assert run(monkeypatch, "accept", str(tmp_path), "--limit", limit) == 4
     assert run(monkeypatch, "accept", str(tmp_path), "--limit", limit, "--measured") == 0
-    assert "Region: the measured configurations alone" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "at every measured configuration of the region" in said
+    assert "Region: the measured configurations alone" in said
 
 
 def test_what_no_region_can_be_is_refused(result) -> None:

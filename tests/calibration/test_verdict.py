@@ -275,3 +275,15 @@ def test_a_constraint_that_contradicts_the_data_is_the_reason(away: float, robus
     assert "Loosen its constraints (elsewhere)" in verdict.reasons[0]
     assert "DH table" not in str(verdict)
     assert "larger weight" not in str(verdict)
+
+
+def test_held_out_rows_that_are_read_wrongly_are_named() -> None:
+    """Degrees in the validation file alone: neither the instrument nor the base moved."""
+    instance = ro.load("position")
+    result = ro.calibrate(instance)
+    assert instance.validation is not None
+    (block,) = instance.validation.blocks
+    degrees = replace(instance.validation, blocks=(replace(block, q=np.degrees(block.q)),))
+    (reason,) = replace(result, record=replace(result.record, validation=degrees)).verdict.reasons
+    assert reason.startswith("Held-out rows do not fit. Likely: the data fit")
+    assert "degrees" in reason

@@ -148,3 +148,14 @@ def test_joint_torques_go_with_the_configurations(tmp_path: Path) -> None:
     notes = ro.use.session_notes(ro.use.in_session(result))
     assert "'first'" in notes[0]
     assert "'second'" in notes[0]
+
+
+def test_sessions_that_stand_apart_are_said_to_be_stated_so(arm: ro.study.SimulatedArm, result: ro.Calibration) -> None:
+    """And frames of the nominal robot are those of the sessions, too: its errors are not the way between its places."""
+    near = arm.problem.data.blocks[0].y
+    rows = [("near", "far")[i >= 20] for i in range(40)]
+    y = np.where(np.array(rows)[:, None] == "far", from_far(near), near)
+    data = ro.Dataset.of(arm.problem.data.q, y, NOISE, session=rows)
+    together = ro.calibrate(arm.problem.on(data))
+    assert any("session_mm = 1000 and session_mrad = 1000 in [scale]" in cause for cause in together.causes)
+    assert result.nominal_errors().max() < 0.02

@@ -375,9 +375,9 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
 
         minimize    |Sigma^-1/2 r(S z)|^2 + |z|^2
 
-    over the identified parameters of base, reflectors, anchors and the like, in units of their scales, of the nominal
-    robot. Returned are the problem of the frames (all other parameters nominal; frames that were stated far off are
-    counted from their registration) and the deviations (f,) [SI]; one without frames comes back as it is.
+    over the identified parameters of base, sessions, reflectors, anchors and the like, in units of their scales, of the
+    nominal robot. Returned are the problem of the frames (all other parameters nominal; frames that were stated far off
+    are counted from their registration) and the deviations (f,) [SI]; one without frames comes back as it is.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
@@ -386,7 +386,7 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
     (9, '1.13 mm')
     """
     p = problem.parameters
-    frames = p.placed & p.identified
+    frames = p.of_frames & p.identified
     if not frames.any():
         return problem, np.zeros(len(p.free))
     alone = problem.identifying(frames)
