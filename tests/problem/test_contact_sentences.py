@@ -136,7 +136,8 @@ def test_readings_of_one_configuration_are_said_to_agree() -> None:
     q = problem.data.q
     again = ro.Dataset.of(np.vstack([q, q[:2]]), np.vstack([y, y[:2] + 1e-4]), 5e-5)
     said = str(ro.calibration.inspect(problem.on(again)))
-    assert "Measured more than once in the same configuration, repeatable to " in said
+    assert "Measured more than once in the same configuration: " in said
+    assert "Repeated readings of a configuration agree to " in said
     assert "1, 13" in said
     assert "more than once" not in str(ro.calibration.inspect(problem))
 

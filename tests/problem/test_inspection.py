@@ -54,7 +54,10 @@ def test_a_ready_robot_of_nearly_the_same_drawing_is_named() -> None:
     problem = ro.load("mixed").problem
     assert problem.robot.name.endswith("UR10e")
     older = ro.read_robot(find_robot("ur10"))
-    (text,) = [each for each in inspect(replace(problem, robots=older)).judgement if "times better" in each]
+    nominal = problem.parameters.nominal.copy()
+    nominal[: older.mdh.size] = older.mdh.ravel()
+    stated = replace(problem, robots=older, parameters=replace(problem.parameters, nominal=nominal))
+    (text,) = [each for each in inspect(stated).judgement if "times better" in each]
     assert "the ready robot ur10e" in text
 
 
