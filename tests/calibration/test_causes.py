@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 from dataclasses import replace
@@ -476,7 +477,7 @@ def test_a_joint_that_the_table_counts_the_other_way_is_said_below_the_headline(
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     top = page.partition("<section")[0]
     assert said in top
-    assert "only for joint values as the table counts them" in top
+    assert "The result holds for the table's joint values" in html.unescape(top)
     assert run(monkeypatch, "accept", out, "--limit", "5") == 4  # without held-out rows
     assert capsys.readouterr().out.count(said) == 1
     assert run(monkeypatch, "calibrate", cell, "--limit", "5") == 4
