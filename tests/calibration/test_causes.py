@@ -965,7 +965,7 @@ def test_a_constant_error_of_distances_is_named() -> None:
     blocks = tuple(replace(block, y=block.y + 0.005) for block in problem.data.blocks)
     result = ro.calibrate(problem.on(replace(problem.data, blocks=blocks)))
     assert not result.verdict.delivered
-    assert "measured distances are 4.7" in likely_causes(result)[1]
+    assert "measured distances are 5 mm too long" in likely_causes(result)[1]
 
 
 def angles_of(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
