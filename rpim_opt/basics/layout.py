@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import filterfalse, takewhile, zip_longest
+from itertools import takewhile, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +35,7 @@ BLANK_NAME = re.compile(r"[^\s\[(]+(?:\s+\d+(?!\S))?(?:\s*[\[(][^\])]*[\])])?")
 """A name with its number and unit, in a header whose names and cells are separated by single blanks."""
 PART_OF_PI = re.compile(r"([+-]?)\s*(?:(\d+(?:\.\d*)?)\s*\*?\s*)?(?:π|pi)\s*(?:/\s*(\d+))?", re.IGNORECASE)
 """An angle [rad] as a part of pi, ``-pi/2``."""
-NUMBER = {
-    mark: re.compile(
-        rf"[+-]?(\d+|(\d*|(?=[\d{mark}]*[{other}])[\d.,]*)[{mark}]\d*|\d*([{other}]\d*){{2,}})(e[+-]?\d+)?", re.I
-    )
-    for mark, other in (".,", ",.")
-}
-"""Numbers by their decimal mark, the last one; what is there more than once alone is the other, 1.234.567."""
-GROUPED = {mark: re.compile(rf"[+-]?[1-9]\d{{0,2}}{re.escape(mark)}\d{{3}}") for mark in ".,"}
+GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 """What may be a whole number with its thousands apart, or one with three decimals."""
 BEYOND = {"angle": 20 * math.pi, "length": 50.0}
 """Joint values and coordinates [SI] that no table has: ten turns, and farther than instruments stand."""
@@ -386,24 +379,39 @@ def _decimal_mark(columns: Mapping[str, Sequence[str]], options: TableOptions) -
     stated = {"comma": ",", "point": "."}.get(options.decimal, options.decimal)
     if stated not in ("", ",", "."):
         raise InputError("--decimal", f"'{stated}'", "comma or point")
-    assumed, grouping = (",", ".") if stated == "," else (".", ",")
-    numbers = [(name, cell) for name, cells in columns.items() for cell in cells if is_numeral(cell)]
-    sure = [cell for _, cell in numbers if not GROUPED[grouping].fullmatch(cell)]
-    unfit = {mark: next(filterfalse(NUMBER[mark].fullmatch, sure), "") for mark in NUMBER}
-    if all(unfit.values()):
-        raise InputError("the numbers", f"'{unfit['.']}' and '{unfit[',']}'", "one decimal mark")
-    found = unfit[assumed]
-    if not any(unfit.values()):
-        doubtful = [(name, cell) for name, cell in numbers if grouping in cell]
-        found = next((cell for name, cell in doubtful if _impossible(cell.replace(grouping, ""), name, options)), "")
-        if doubtful and not found and not stated:
-            found = f"'{doubtful[0][1]}', whose mark may separate thousands or decimals"
-            raise InputError("the numbers", found, "--decimal comma, or --decimal point")
-    mark = grouping if found else assumed
-    if stated and found:
-        return mark, (f"--decimal {options.decimal} does not apply: found '{found}'.",)
+    grouping = "." if stated == "," else ","
+    shown: dict[str, str] = {}  # the first cell with every mark
+    doubtful: list[tuple[str, str]] = []  # numbers whose mark may separate thousands, with their columns
+    for name, cells in columns.items():
+        for cell in cells:
+            mark = _mark(cell)
+            if mark == grouping and GROUPED.fullmatch(cell):
+                doubtful.append((name, cell))
+            elif mark:
+                shown.setdefault(mark, cell)
+    if len(shown) > 1:
+        raise InputError("the numbers", f"'{shown[',']}' and '{shown['.']}'", "one decimal mark")
+    if not shown:
+        beyond = [cell for name, cell in doubtful if _impossible(cell.replace(grouping, ""), name, options)]
+        shown = {grouping: beyond[0]} if beyond else {}
+    mark = next(iter(shown), stated)
+    if doubtful and not mark:
+        found = f"'{doubtful[0][1]}', whose mark may separate thousands or decimals"
+        raise InputError("the numbers", found, "--decimal comma, or --decimal point")
+    mark = mark or "."
+    if stated and mark != stated:
+        return mark, (f"--decimal {options.decimal} does not apply: found '{shown[mark]}'.",)
     why = "as requested" if stated else "no comma can be a thousands separator"
     return mark, (f"decimal commas: {why}.",) if mark == "," else ()
+
+
+def _mark(cell: str) -> str:
+    """Return the last mark of a number, the other one if it is there more than once alone, or an empty text."""
+    last = max(cell.rfind(","), cell.rfind("."))
+    if last < 0 or not is_numeral(cell):
+        return ""
+    mark, other = (",", ".") if cell[last] == "," else (".", ",")
+    return other if other not in cell and cell.count(mark) > 1 else mark  # 1.234.567
 
 
 def _impossible(number: str, name: str, options: TableOptions) -> bool:
@@ -468,23 +476,13 @@ def _one_row_each(table: RawTable) -> RawTable:
     texts = {name: [str(cell).strip() for cell in cells] for name, cells in table.columns.items()}
     letters = [cell.lower() for cell in texts.pop(axis)]
     parts = sorted(set(letters))
-    for name, cells in texts.items():
-        pairs = zip(cells, letters, strict=True)
-        points_of = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell, re.IGNORECASE) for cell, letter in pairs]
-        if all(points_of):  # P1.X
-            texts[name] = [match[1] for match in points_of if match]
+    texts = {name: _without_letters(cells, letters) for name, cells in texts.items()}
     points = next(filter(None, (_points(cells, letters) for cells in texts.values())), [])
     if not points:
         accepted = f"a column that names the point, with {', '.join(parts)} once for each point"
         raise InputError("the header", f"one row per coordinate ('{axis}')", accepted)
-    every = {name: [{cells[i] for i in rows.values()} for rows in points] for name, cells in texts.items()}
-    columns = {name: [min(own) for own in each] for name, each in every.items() if max(map(len, each)) == 1}
-    numeric = [name for name, cells in texts.items() if name not in columns and _is_numeric(cells)]
-    values = [name for name in numeric if VALUE.search(name)] or numeric
-    if len(values) != 1:
-        found = f"one row per coordinate, value columns: {', '.join(values) or 'none'}"
-        raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
-    value = values[0]
+    columns = _of_points(texts, points)
+    value = _value_column({name: cells for name, cells in texts.items() if name not in columns})
     units = [cells for cells in texts.values() if {cell.lower() for cell in cells} <= UNIT_SIGNS]
     for part in parts:
         of_part = {cells[i] for cells in units for i, letter in enumerate(letters) if letter == part}
@@ -492,6 +490,29 @@ def _one_row_each(table: RawTable) -> RawTable:
         columns[_with_unit(part, unit)] = [texts[value][rows[part]] if part in rows else "" for rows in points]
     note = f"one row per coordinate: column '{value}' by '{axis}'."
     return replace(table, columns=columns, notes=(*table.notes, note))
+
+
+def _of_points(texts: Mapping[str, list[str]], points: Sequence[Mapping[str, int]]) -> dict[str, list[str]]:
+    """Return the columns that hold one text for all rows of a point, with one cell for each point."""
+    every = {name: [{cells[i] for i in rows.values()} for rows in points] for name, cells in texts.items()}
+    return {name: [min(own) for own in each] for name, each in every.items() if max(map(len, each)) == 1}
+
+
+def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:
+    """Return the names of points where every cell names the coordinate besides, ``P1.X``; others as they are."""
+    pairs = zip(cells, letters, strict=True)
+    named = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell, re.IGNORECASE) for cell, letter in pairs]
+    return [match[1] for match in named if match] if all(named) else cells
+
+
+def _value_column(columns: Mapping[str, Sequence[str]]) -> str:
+    """Return the only column of numbers, or the only one of these whose name states it."""
+    numeric = [name for name, cells in columns.items() if _is_numeric(cells)]
+    measured = [name for name in numeric if VALUE.search(name)] or numeric
+    if len(measured) != 1:
+        found = f"one row per coordinate, value columns: {', '.join(measured) or 'none'}"
+        raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
+    return measured[0]
 
 
 def _names_parts(cells: Sequence[Any]) -> bool:

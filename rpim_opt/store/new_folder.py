@@ -125,14 +125,7 @@ def new_problem(
     kind, how = _kind(arm, found, board, measurement)
     found = replace(found, kind=kind)
     rows = rows_of(found, on_board(found.columns, board.board), arm, kind)
-    held = np.zeros(len(rows), dtype=bool)
-    if hold_out is not None:  # configurations that are drawn at random
-        known = len(np.unique(rows.configuration))
-        if not 0 < hold_out < 1 or known < 2:
-            accepted = "a fraction between 0 and 1 of two or more configurations"
-            raise InputError("--hold-out", f"{hold_out:g} of {known} configurations", accepted)
-        drawn = rows.configurations(min(max(round(hold_out * known), 1), known - 1), seed)
-        held = np.isin(rows.configuration, drawn.configuration)
+    held = _held_out(rows, hold_out, seed)
     tables = {identified: _rows(found.columns, ~held), validated: _rows(found.columns, held), seen: board.table}
     if later:
         other = in_time_order(understand_of(arm, later, kind.name, found.options))
@@ -160,6 +153,18 @@ def new_problem(
     of_chain = [SHARED if before else added] if chain else []
     notes = (*_remarks(arm, source, found, rows), f"Measurement {kind.name}: {how}.", guessed, *of_chain)
     return Started(folder, counts, notes, found, not dry_run)
+
+
+def _held_out(rows: Dataset, fraction: float | None, seed: int) -> np.ndarray:
+    """Return which rows (N,) belong to configurations that are drawn at random."""
+    if fraction is None:
+        return np.zeros(len(rows), dtype=bool)
+    known = len(np.unique(rows.configuration))
+    if not 0 < fraction < 1 or known < 2:
+        accepted = "a fraction between 0 and 1 of two or more configurations"
+        raise InputError("--hold-out", f"{fraction:g} of {known} configurations", accepted)
+    drawn = rows.configurations(min(max(round(fraction * known), 1), known - 1), seed)
+    return np.isin(rows.configuration, drawn.configuration)
 
 
 def _assumed(found: Understanding) -> dict[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -294,10 +294,16 @@ def update(
     errors = {name: {"before": result.errors(of), "after": updated.errors(of)} for name, of in rows.items() if of}
     figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
     figures = {name: each for name, each in figures.items() if each["after"]["count"]}  # those with lengths
-    # of the earlier record what holds for the new measurements, too
-    record = result.record
+    updated = replace(updated, record=_carried_on(result.record, last, source))
+    moved = _moved(result, updated, released, changes)
+    vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
+    return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
+
+
+def _carried_on(record: Record, last: Earlier, source: str) -> Record:
+    """Return the record of an updated calibration: of the earlier one what holds for the new measurements, too."""
     first_source = record.source.rpartition(BEFORE)[2]  # what is said of a file belongs to its own measurements
-    carried_on = Record(
+    return Record(
         title=f"{record.title.removesuffix(UPDATED)}{UPDATED}",
         source=f"{source}{BEFORE}{first_source}" if first_source else source,
         excluded=dict.fromkeys(last.excluded, "far outside the prediction intervals of the previous calibration"),
@@ -309,17 +315,17 @@ def update(
         reading=record.reading,
         terms=record.terms,
     )
-    updated = replace(updated, record=carried_on)
-    moved = _moved(result, updated, released, changes)
-    # frames, released or new, with a direction in which the new rows know less than the prior's scale
-    known = set(result.problem.parameters.free.names).difference(released)
+
+
+def _undetermined(updated: Calibration, known: Collection[str]) -> tuple[str, ...]:
+    """Return the frames, but ``known`` ones, with a direction in which rows know less than the prior's scale."""
+    free = updated.problem.parameters.free
     frames: dict[str, list[int]] = {}
     for i in np.flatnonzero(free.of_frames):
         if free.names[i] not in known:
             frames.setdefault(free.names[i].rpartition("_")[0], []).append(int(i))
     A = updated.program.model.A  # in standard deviations of the noise, by deviations in units of the scales
-    vague = tuple(name for name, index in frames.items() if np.linalg.matrix_rank(A[:, index], tol=1.0) < len(index))
-    return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
+    return tuple(name for name, index in frames.items() if np.linalg.matrix_rank(A[:, index], tol=1.0) < len(index))
 
 
 def _robots(result: Calibration) -> str:

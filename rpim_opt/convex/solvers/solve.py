@@ -80,7 +80,7 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
     any other                    all rows in Clarabel
     ============================ ===================================================
 
-    Of quadratic losses and penalties without constraints `Program.solve` knows a formula, and does not come here.
+    Of quadratic losses and penalties without constraints or damping `Program.solve` knows a formula.
     Penalty and constraints select what solves a small program of n + 1 rows: an active set where they are linear or
     quadratic, else Clarabel. Entries are equations, or configurations where the loss gets their norms.
 

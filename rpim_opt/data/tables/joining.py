@@ -174,12 +174,7 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
         return _row_numbers(joints, values, pair if telling else None)
     common = [name for name in joints.raw if name in values.raw]
     stated = key.lower() or (None if telling and pair else _only(common))
-    labels = _normal(joints.columns.get("label", ()))
-    chosen = None
-    if key in ("", "label") and not (telling and counts_rows(labels)):  # row numbers, if others match
-        sides = (_normal(values.columns.get(column, ())) for column in ("label", "configuration"))
-        keys = (_keyed("label", (), labels, side) for side in sides)
-        chosen = next((each for each in keys if {*labels} & {*each.right}), None)
+    chosen = _labels(joints, values, bool(telling)) if key in ("", "label") else None
     if not chosen and stated in common:
         chosen = _keyed(f"column '{stated}'", (stated,), _normal(joints.raw[stated]), _normal(values.raw[stated]))
     if not chosen and not pairs:  # names that differ, with the same numbers
@@ -197,6 +192,16 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
 def _only(items: Sequence[Any]) -> Any:
     """Return the only one; None where there is none, or several."""
     return items[0] if len(items) == 1 else None
+
+
+def _labels(joints: Understood, values: Understood, others_tell: bool) -> Key | None:
+    """Return the labels that rows with joints and measured ones share, unless they are row numbers and others match."""
+    labels = _normal(joints.columns.get("label", ()))
+    if others_tell and counts_rows(labels):
+        return None
+    sides = (_normal(values.columns.get(column, ())) for column in ("label", "configuration"))
+    keys = (_keyed("label", (), labels, side) for side in sides)
+    return next((each for each in keys if {*labels} & {*each.right}), None)
 
 
 def _pairs(joints: Understood, values: Understood, key: str, numbers: bool = False) -> list[Key]:
