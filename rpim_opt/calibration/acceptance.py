@@ -21,14 +21,13 @@ from rpim_opt.calibration.held_out import (
     displacement,
     excluded_by_fit,
     headline_errors,
-    held_out_errors,
     of_positions,
-    required_coverage,
     rows_used,
 )
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage
 from rpim_opt.calibration.verdict import Verdict, refuse_misread
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset

@@ -6,71 +6,27 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import bdtr, fdtrc, fdtri
+from scipy.special import fdtrc
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.bayes.hyperparameters import sessions_spread
-from rpim_opt.bayes.outliers import by_block
-from rpim_opt.calibration.covariance import UNLIKELY, coverage_factor, noise_covariances, row_freedom
+from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
-from rpim_opt.data.record import CONFIDENCE, HeldOut
+from rpim_opt.data.record import HeldOut
 from rpim_opt.problem.diagnosis import common_rows
 from rpim_opt.problem.registration.closed_forms import register, transformed
 
 FEWEST = 5  # held-out rows below which they are too few to judge
 GROSS = 6.0  # factor on the median distance from which on a row does not count for a registration
-RARE = 0.01  # probability that data like those of the calibration have any row that is named
 
 
 def rows_used(result: Calibration, data: Dataset) -> dict[str, str]:
     """Return the labels of measurements that are copies of identification rows, with the labels of those."""
     return dict(common_rows(result.problem.sample().data, data))
-
-
-def held_out_errors(result: Calibration, data: Dataset, counted: np.ndarray | None = None) -> HeldOut:
-    """Return the errors of a calibration on measurements that it did not use, beside their prediction intervals.
-
-    The coverage is that of the rows that are ``counted`` (N,), by default all.
-    """
-    N = len(data)
-    sigmas, allowed = np.full((2, N), np.nan)
-    errors = result.nominal_errors(data), result.errors(data), result.errors(data, "angle")
-    held = HeldOut(data.label, len(result.problem.labels), *errors, sigmas, allowed)
-    C = result.known_covariance
-    if C is None:
-        return held
-    counted = np.ones(N, dtype=bool) if counted is None else counted
-    inside: list[np.ndarray] = []
-    problem = result.problem.on(data)
-    parts = by_block(problem, np.column_stack(problem.slopes(result.x)))
-    known = np.isfinite(np.diag(C))
-    C = np.where(np.outer(known, known), C, 0.0)
-    added = noise_covariances(problem, result.variance_factor)
-    for (block, part), reading, session in zip(parts, added.reading, added.session, strict=True):
-        k = len(block.measurement.components)
-        r, A = part[:, :, 0], part[:, :, 1:]
-        S = A @ C @ A.transpose(0, 2, 1) + reading
-        freedom = row_freedom(result.freedom, sessions_spread(result.learned), S, session)
-        squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)
-        predicted = (A[:, :, ~known] == 0).all(axis=(1, 2))
-        sigmas[block.row] = np.where(predicted, np.sqrt(squares), np.nan)
-        limit = np.sqrt(k * fdtri(k, freedom, 1 - RARE / N))
-        allowed[block.row] = np.where(predicted, limit, np.nan)
-        lengths = np.array([d in ("length", "pixel") for d in block.measurement.components.values()])
-        factor = coverage_factor(freedom, CONFIDENCE)[:, None]
-        within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
-        inside.append(within[predicted & counted[block.row]][:, lengths].ravel())
-    covered = np.concatenate(inside)
-    return replace(held, coverage=float(covered.mean()) if len(covered) else None)
-
-
-def required_coverage(rows: int) -> float:
-    """Return the share of coordinates in 95 % intervals that so many rows, each counted once, rarely fall below."""
-    return float(np.sum(bdtr(np.arange(rows + 1), rows, CONFIDENCE) < UNLIKELY)) / rows
 
 
 def coverage_text(coverage: float, rows: int) -> str:

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import bdtr, fdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import Tabled
+from rpim_opt.bayes.hyperparameters import sessions_spread
+from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.transmission import series
-from rpim_opt.calibration.covariance import coverage_factor, noise_covariances, position_noise
+from rpim_opt.calibration.covariance import UNLIKELY, coverage_factor, noise_covariances, position_noise, row_freedom
 from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.position import position
+from rpim_opt.data.record import CONFIDENCE, HeldOut
 from rpim_opt.robot.terms import transmission
+
+RARE = 0.01  # probability that data like those of the calibration have any row that is named
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -200,3 +207,45 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
         drawn = program.on(program.model.with_values(b))
         solutions.append(drawn.path([result.weight])[0].z)
     return np.array(solutions) * result.problem.parameters.free.scale
+
+
+def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None = None) -> HeldOut:
+    """Return the errors of a calibration on measurements that it did not use, beside their prediction intervals.
+
+    The coverage is that of the rows that are ``counted`` (N,), by default all.
+    """
+    N = len(data)
+    sigmas, allowed = np.full((2, N), np.nan)
+    errors = result.nominal_errors(data), result.errors(data), result.errors(data, "angle")
+    held = HeldOut(data.label, len(result.problem.labels), *errors, sigmas, allowed)
+    C = result.known_covariance
+    if C is None:
+        return held
+    counted = np.ones(N, dtype=bool) if counted is None else counted
+    inside: list[np.ndarray] = []
+    problem = result.problem.on(data)
+    parts = by_block(problem, np.column_stack(problem.slopes(result.x)))
+    known = np.isfinite(np.diag(C))
+    C = np.where(np.outer(known, known), C, 0.0)
+    added = noise_covariances(problem, result.variance_factor)
+    for (block, part), reading, session in zip(parts, added.reading, added.session, strict=True):
+        k = len(block.measurement.components)
+        r, A = part[:, :, 0], part[:, :, 1:]
+        S = A @ C @ A.transpose(0, 2, 1) + reading
+        freedom = row_freedom(result.freedom, sessions_spread(result.learned), S, session)
+        squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)
+        predicted = (A[:, :, ~known] == 0).all(axis=(1, 2))
+        sigmas[block.row] = np.where(predicted, np.sqrt(squares), np.nan)
+        limit = np.sqrt(k * fdtri(k, freedom, 1 - RARE / N))
+        allowed[block.row] = np.where(predicted, limit, np.nan)
+        lengths = np.array([d in ("length", "pixel") for d in block.measurement.components.values()])
+        factor = coverage_factor(freedom, CONFIDENCE)[:, None]
+        within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
+        inside.append(within[predicted & counted[block.row]][:, lengths].ravel())
+    covered = np.concatenate(inside)
+    return replace(held, coverage=float(covered.mean()) if len(covered) else None)
+
+
+def required_coverage(rows: int) -> float:
+    """Return the share of coordinates in 95 % intervals that so many rows, each counted once, rarely fall below."""
+    return float(np.sum(bdtr(np.arange(rows + 1), rows, CONFIDENCE) < UNLIKELY)) / rows

@@ -15,8 +15,10 @@ from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.basics.units import fits
 from rpim_opt.calibration.diagnosis import flagged
 from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage
 from rpim_opt.convex.constraints import name_of
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.record import HeldOut
 from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.diagnosis import ANGULAR, NOISY, NOTICED, REACH, SLIGHT, decimals_of, first
@@ -199,9 +201,12 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     size = residuals["length"][0]
     ratio = max(residuals["length"][1], residuals["pixel"][1])
     share = size / arm_length(result.problem)
+    checked = _overdetermined(result)
     for each, (size_of, ratio_of) in residuals.items():
         nominal = noise_ratio(result.problem, result.nominal_errors(dimension=each), each)  # with frames fitted
-        if size_of > COMPUTED_RMS and 0 < min(ratio_of / OVERSTATED, NOISY * nominal) < 1:  # 0: it was not measured
+        if (
+            checked and size_of > COMPUTED_RMS and 0 < min(ratio_of / OVERSTATED, NOISY * nominal) < 1
+        ):  # 0: it was not measured
             yield f"Residuals are {ratio_of:.2g} times the stated noise, which is in another unit or far too large."
     if ratio > NOISY and share > REACH:
         yield (
@@ -214,6 +219,12 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
             f"Residual RMS {three_digits(1e3 * size)} mrad: {three_digits(ratio)} times the measurement noise; a "
             f"robot's own errors stay below {1e3 * ANGULAR:g} mrad."
         )
+
+
+def _overdetermined(result: Outcome) -> bool:
+    """Whether equations are so many that nominal errors with fitted frames do not vanish by themselves."""
+    p = result.problem.parameters
+    return result.program.model.equations >= SPARE * int((p.placed & p.identified).sum()) + 1
 
 
 def _repeatability(result: Outcome) -> Iterator[str]:
@@ -271,11 +282,9 @@ def _worse(result: Outcome) -> Iterator[str]:
         tight = ", or constraints are too tight" if result.formulation.constraints else ""
         yield f"{sentence.removesuffix('.')}: the weight is too large{tight}."
     held, validation = result.record.held_out, result.record.validation
-    if held is not None:
-        nominal, identified = held.nominal, held.error
-    elif validation is not None:
-        nominal, identified = result.nominal_errors(validation), result.errors(validation)
-    else:
+    if held is None and validation is not None:
+        held = held_out_errors(result, validation)
+    if held is None:
         checked = result.record.earlier or result.known_covariance is None  # an update is judged against what was known
         if not checked and result.spread.spare < INTERPOLATED:
             yield (
@@ -283,20 +292,23 @@ def _worse(result: Outcome) -> Iterator[str]:
                 "of freedom, and no validation data check it. Measure more configurations."
             )
         return
-    said = worse_sentence(nominal, identified) if worse_than_nominal(nominal, identified) else ""
-    if not said and rms(result.errors()) < rms(identified):
-        said = implausible(result, identified)
+    said = worse_sentence(held.nominal, held.error) if worse_than_nominal(held.nominal, held.error) else ""
+    if not said and rms(result.errors()) < rms(held.error):
+        said = implausible(result, held)
     if said:
         read = "" if validation is None or not result.problem.keeps_rows else misread(result, validation)
         yield f"Held-out rows do not fit. {read}" if read else said
 
 
-def implausible(result: Outcome, error: Array) -> str:
-    """Return a sentence if most errors (N,) [m] are larger than any robot's own; otherwise an empty text.
+def implausible(result: Outcome, held: HeldOut) -> str:
+    """Return a sentence if most errors on held-out rows are larger than any robot's own; otherwise an empty text.
 
-    If errors of the calibration's own rows are as large, something else is wrong.
+    If errors of the calibration's own rows are as large, something else is wrong; if the uncertainty of a calibration
+    from few rows explains them, nothing is.
     """
-    most = REACH * arm_length(result.problem)
+    error, most = held.error, REACH * arm_length(result.problem)
+    if held.coverage is not None and held.coverage >= required_coverage(len(error)):
+        return ""
     if not np.isfinite(error).any() or np.nanmedian(error) <= most or np.nanmedian(result.errors()) > most:
         return ""
     return (
@@ -309,9 +321,8 @@ def implausible(result: Outcome, error: Array) -> str:
 def _computed(result: Outcome) -> Iterator[str]:
     """Say that the nominal robot explains the data to rounding: they were computed with it."""
     problem = result.problem
-    frames = int((problem.parameters.placed & problem.parameters.identified).sum())
     measured = stated_variance(problem, "length") > 0
-    if result.program.model.equations < SPARE * frames + 1 or not measured.any():
+    if not _overdetermined(result) or not measured.any():
         return
     errors = result.nominal_errors()
     nominal = rms(errors[measured])

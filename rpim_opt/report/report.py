@@ -20,10 +20,10 @@ from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import joint_columns, printed
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
-from rpim_opt.calibration.held_out import coverage_text, headline_errors, held_out_errors, rows_used
+from rpim_opt.calibration.held_out import coverage_text, headline_errors, rows_used
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import Uncertainty, position_budget, transmission_errors
+from rpim_opt.calibration.uncertainty import Uncertainty, held_out_errors, position_budget, transmission_errors
 from rpim_opt.convex import select
 from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.data.dataset import Block as Rows

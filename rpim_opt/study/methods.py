@@ -15,8 +15,8 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.units import number
 from rpim_opt.calibration import baselines
-from rpim_opt.calibration.held_out import held_out_errors
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.uncertainty import held_out_errors
 from rpim_opt.calibration.verdict import judge
 from rpim_opt.convex.formulation import FORMULATIONS, formulation_of, tikhonov
 from rpim_opt.convex.program import Program

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.acceptance import inconclusive, measured_workspace
-from rpim_opt.calibration.held_out import held_out_errors
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
+from rpim_opt.calibration.uncertainty import held_out_errors
 from rpim_opt.problem.blocks import PartitionedProblem
 from rpim_opt.problem.multi_robot import unknown_sessions
 from rpim_opt.robot.parameters import model_parameters, of_session

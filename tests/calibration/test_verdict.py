@@ -68,6 +68,26 @@ def test_held_out_rows_that_no_robot_misses_so_far_are_a_reason() -> None:
     assert "--register" in verdict.reasons[0]
 
 
+def test_errors_that_few_rows_leave_are_no_reason() -> None:
+    """Five rows of an arm with deviations of 5 mm: errors of 6 mm, a third of nominal ones, are within intervals."""
+    problem, _ = simulated(configurations=45, noise=5e-5, seed=4, size=5)
+    few, other = (problem.data.take(rows) for rows in (np.arange(5), np.arange(5, 45)))
+    result = ro.calibrate(problem.on(few))
+    assert np.median(result.errors(other)) > 5e-3
+    assert replace(result, record=replace(result.record, validation=other)).verdict.delivered
+
+
+def test_few_lengths_do_not_tell_that_the_noise_is_overstated() -> None:
+    """Anchor, offset and reflector take up seven of eight equations."""
+    problem, _ = simulated(configurations=48, seed=5, size=0.3)
+    away = np.linalg.norm(problem.data.blocks[0].y - [0.4, 0.9, 1.1], axis=1, keepdims=True) + 0.05
+    away += 5e-4 * np.random.default_rng(5).normal(size=away.shape)
+    data = ro.Dataset.of(problem.data.q, away, 5e-4, measurement="cable")
+    few, other = data.take(np.arange(8)), data.take(np.arange(8, 48))
+    result = ro.calibrate(ro.problem_from(problem.robot, data).on(few))
+    assert replace(result, record=replace(result.record, validation=other)).verdict.delivered
+
+
 def test_joint_zeros_are_not_limited() -> None:
     """An arm whose zeros are 45 mrad off is as good as another."""
     problem = simulated_arm("irb120")
