@@ -20,7 +20,7 @@ from rpim_opt.problem.blocks import in_parts
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import bounding, moved, predicted
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
+from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
 from rpim_opt.robot.parameters import of_joint, own_name
 
 ALONE = 1e-9  # a configuration decides a direction alone where others know less than this share of it
@@ -251,8 +251,7 @@ def _slopes(result: Outcome) -> tuple[Array, Array]:
     D = J.reshape(-1, J.shape[2])
     p = p - p.mean(axis=0)
     turning = np.cross(np.eye(3), p[:, None])
-    values = dict(zip(of_robot.names, nominal, strict=True))
-    base = numeric_frame([values[f"base_{c}"] for c in FRAME])
+    base = numeric_frame(nominal[of_robot.frame("base_")])
     along = base[:3, :3] @ forward_kinematics(there.robot, q)[:, :3, :3]
     fitting = np.concatenate([np.tile(np.eye(3), (len(p), 1, 1)), turning, along], axis=2).reshape(-1, 9)
     U = np.linalg.qr(fitting)[0]

@@ -203,6 +203,10 @@ class Parameters(Tabled):
         shared = {name for name in self.names if "." not in name and f"{robot}.{name}" not in known}
         return np.flatnonzero([name in known or name in shared for name in self.names])
 
+    def frame(self, prefix: str) -> np.ndarray:
+        """Return the indices (6,) of a frame's parameters by their prefix, ``base_``: position, roll, pitch, yaw."""
+        return np.array([self.names.index(prefix + axis) for axis in FRAME_DIMENSION])
+
     @property
     def of_frames(self) -> np.ndarray:
         """Which parameters (P,) are of frames (base, reflectors, sessions, ...), not of the robot."""

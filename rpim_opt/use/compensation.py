@@ -472,7 +472,7 @@ class _Cell(NamedTuple):
             named = choices(marker, [m or "no marker" for m in known])
             raise InputError("--marker", found, f"{named}, or a controller's TCP by --tool")
         prefix = tool_prefix(marker)
-        at = [p.names.index(prefix + c) for c in FRAME]
+        at = p.frame(prefix)
         place = p.values(x)[at] if tool is None else np.asarray(tool, dtype=float)
         if place.shape != (6,) or not np.isfinite(place).all():
             raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
@@ -487,7 +487,7 @@ class _Cell(NamedTuple):
         own = whole.free.places_of(which)[p.identified[whole.identified[whole.places_of(which)]]]
         values = p.values(x)
         nominal, identified = (dict(zip(p.names, of.tolist(), strict=True)) for of in (p.nominal, values))
-        stated = numeric_frame([nominal[f"base_{c}"] for c in FRAME])
+        stated = numeric_frame(p.nominal[p.frame("base_")])
         moved = np.linalg.inv(stated) @ base_frame(result, which) if base else np.eye(4)
         measured = result.problem.sample().alone(which)
         repeatability = measured.repeatability

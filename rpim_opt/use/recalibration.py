@@ -339,8 +339,8 @@ def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation:
     if not base or not displacement(result, problem.data, held_out_errors(result, problem.data))[0]:
         return ""
     registered = _recalibrated(result, problem, base, inflation, None)
-    values = [each.problem.parameters.by_name(each.x) for each in (result, registered)]
-    was, now = (np.array([of[BASE + axis] for axis in FRAME]) for of in values)
+    tables = ((each.problem.parameters, each.x) for each in (result, registered))
+    was, now = (p.values_at(x)[p.frame(BASE)] for p, x in tables)
     if same_place(was, now):
         return ""
     return (

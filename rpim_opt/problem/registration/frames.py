@@ -34,7 +34,7 @@ from rpim_opt.problem.registration.closed_forms import (
 )
 from rpim_opt.problem.registration.points import UNEXPLAINED, Candidates, Points, fit_arms
 from rpim_opt.robot.chain import RobotSetup
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
+from rpim_opt.robot.kinematics import forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, model_parameters, tool_prefix
@@ -129,7 +129,7 @@ def shared_bases(problem: CalibrationProblem) -> dict[str, Array]:
         if not places:
             continue
         p = alone.parameters
-        k = _frame_of(p, "base_")
+        k = p.frame("base_")
         base = numeric_frame(p.nominal[k])
         common = {name: place for name, place in places.items() if name in known}
         free = p.identified[k].all() and all(block.touched is not None for block in alone.data.blocks)
@@ -329,16 +329,16 @@ def relocated(problem: Source) -> Source | None:
                 nominal[k] = np.where(nominal[k] == p.nominal[k], alone.parameters.nominal, nominal[k])
         for name, place in shared_bases(problem.sample()).items():
             own = p.of_robot(name)
-            base = _frame_of(own, "base_")
+            base = own.frame("base_")
             if _misplaced(own, base, place):
                 nominal[p.places_of(name)[base]] = place
     else:
-        base = _frame_of(p, "base_")
+        base = p.frame("base_")
         if not p.identified[base].all():
             return None
         try:
             data = with_poses(problem.sample().data, dict(zip(p.names, p.nominal.tolist(), strict=True)))
-            at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
+            at = {block.markers[0]: p.frame(tool_prefix(block.markers[0])) for block in data.blocks}
             there, located, _ = locate(problem.robot, data, {marker: p.nominal[k] for marker, k in at.items()})
         except InputError:
             return None
@@ -349,11 +349,6 @@ def relocated(problem: Source) -> Source | None:
     if (nominal == p.nominal).all():
         return None
     return problem.with_parameters(replace(p, nominal=nominal))
-
-
-def _frame_of(p: Parameters, prefix: str) -> np.ndarray:
-    """Return the places (6,) of a frame in a table."""
-    return np.array([p.names.index(prefix + component) for component in FRAME])
 
 
 def _misplaced(p: Parameters, k: np.ndarray, place: Array) -> bool:

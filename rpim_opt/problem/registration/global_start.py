@@ -241,7 +241,7 @@ def with_mapping(problem: CalibrationProblem, points: Points, sign: Array, zero:
     if not points.lengths:
         places["base_"] = fit.base[0]
     elif names := _anchor(problem):
-        base = numeric_frame(p.nominal[[p.names.index(f"base_{c}") for c in FRAME]])
+        base = numeric_frame(p.nominal[p.frame("base_")])
         anchor = transformed(base, -fit.base[0, :3, 3])
         values |= dict(zip(names, [*anchor, fit.offset[0]], strict=True))
     several = len(fit.tools[0]) // len(points.names)

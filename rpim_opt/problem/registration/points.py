@@ -87,7 +87,7 @@ def points_of(problem: CalibrationProblem) -> Points | None:
     if sum(len(block.row) for block in blocks) < FEWEST_ROWS:
         return None
     markers = list(dict.fromkeys(block.markers[0] for block in blocks))
-    tools = np.array([[own[tool_prefix(marker) + c] for c in FRAME[:3]] for marker in markers])
+    tools = np.array([p.nominal[p.frame(tool_prefix(marker))[:3]] for marker in markers])
     tools[np.linalg.norm(tools, axis=1) > LONGEST] = 0.0  # where a fit to lengths in another unit put them
     turns = None
     if len(markers) == 1 and all(block.measurement.name == "pose" for block in blocks):
@@ -110,13 +110,12 @@ def lengths_of(problem: CalibrationProblem) -> Points | None:
     if len(kinds) > 1 or blocks[0].measurement.name not in ("cable", "distance") or len(problem.arms) > 1:
         return None
     p = problem.parameters
-    own = dict(zip(p.names, p.nominal.tolist(), strict=True))
     names = list(dict.fromkeys(blocks[0].markers))
     if len(problem.data) < problem.robot.dof + 3 * len(names) + len(FRAME):
         return None
     q, y, row = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("q", "y", "row"))
     marker = np.tile([names.index(marker) for marker in blocks[0].markers], (len(row), 1))
-    tools = np.array([[own[tool_prefix(marker) + c] for c in FRAME[:3]] for marker in names])
+    tools = np.array([p.nominal[p.frame(tool_prefix(marker))[:3]] for marker in names])
     whole = Points(problem.robot, q, y, marker, tools, None, row, names=tuple(names))
     return whole.take(np.argsort(row, kind="stable")).evenly(MOST_ROWS)
 
