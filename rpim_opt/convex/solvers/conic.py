@@ -31,6 +31,7 @@ ATTEMPTS: tuple[Attempt, ...] = (
     (("static_regularization_constant", 1e-10),),
     (("equilibrate_enable", True),),
     (("static_regularization_constant", 1e-7),),
+    (("static_regularization_constant", 1e-7), ("equilibrate_enable", True)),  # unknowns of 1e4 prior scales
 )
 """What is tried in turn: where one factorization stalls, another does not."""
 EQUILIBRATED: Attempt = (
