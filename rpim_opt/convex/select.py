@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from importlib import import_module
 from inspect import signature
+from pathlib import Path
+from pkgutil import iter_modules
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, pick
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.curve import corner, l_curve
+from rpim_opt.convex.rules.folds import RULES as HOLDING_OUT
 from rpim_opt.convex.rules.folds import k_fold, leave_one_out, two_step
 from rpim_opt.convex.rules.scores import discrepancy, gcv, quasi_optimality, reml
 from rpim_opt.convex.rules.selection import Selection
@@ -49,24 +53,17 @@ def compare(program: Program) -> dict[str, Selection]:
     quick = program.closed_form and len(np.unique(program.model.group)) <= 200
     chosen = {}
     for name, rule in SELECTORS.items():
-        if not quick and name in ("leave_one_out", "k_fold", "two_step"):
+        if not quick and rule in HOLDING_OUT:
             continue
         with contextlib.suppress(InputError, NoSolutionFound):  # it does not serve this formulation or these data
             chosen[name] = rule(program)
     return chosen
 
 
-SELECTORS: dict[str, Callable[[Program], Selection]] = {
-    "reml": reml,
-    "l_curve": l_curve,
-    "corner": corner,
-    "two_step": two_step,
-    "gcv": gcv,
-    "leave_one_out": leave_one_out,
-    "k_fold": k_fold,
-    "discrepancy": discrepancy,
-    "quasi_optimality": quasi_optimality,
-}
+_names = [each.name for each in iter_modules([str(Path(__file__).with_name("rules"))])]
+_rules = [getattr(import_module(f"{__package__}.rules.{name}"), "RULES", ()) for name in reversed(_names)]  # REML first
+SELECTORS: dict[str, Callable[[Program], Selection]] = {rule.__name__: rule for some in _rules for rule in some}
+"""The rules that come with the package, by the names of their functions: ``RULES`` of the modules in ``rules``."""
 LEARNED = "learned"
 """Stands for hyperparameters that are estimated from the data, and no weight."""
 

@@ -1,4 +1,4 @@
-"""A measurement type and a table format of a stranger's, in one file of the package each: every command knows them."""
+"""A measurement type, a table format and a rule of a stranger's, each in one file that every command finds."""
 
 from __future__ import annotations
 
@@ -52,6 +52,23 @@ def read(text):
 
 FORMATS = (TableFormat("MELFA variables", (".prg",), read),)
 '''
+UNIT = '''
+"""The weight that stated noise and scales are for."""
+
+import numpy as np
+
+from rpim_opt.convex.rules.selection import choice, on_inliers, weight_grid
+
+
+@on_inliers
+def unit(program):
+    weights = weight_grid(program)
+    far = np.abs(np.log(weights))
+    return choice("unit", weights, far, int(np.argmin(far)), "nearest to one")
+
+
+RULES = (unit,)
+'''
 COUNT = 80
 NOISE = 0.01
 """[mm]"""
@@ -64,6 +81,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(ROOT / "rpim_opt", place / "rpim_opt", ignore=shutil.ignore_patterns("__pycache__"))
     (place / "rpim_opt" / "data" / "measurements" / "height.py").write_text(HEIGHT)
     (place / "rpim_opt" / "data" / "tables" / "formats" / "melfa.py").write_text(MELFA)
+    (place / "rpim_opt" / "convex" / "rules" / "unit.py").write_text(UNIT)
     write_robot(ARM, place / "robot.toml")
     rng = np.random.default_rng(3)
     q = rng.uniform(-120, 120, (COUNT, 6)).round(4)
@@ -120,3 +138,10 @@ def test_a_controllers_variables_beside_a_table_of_points(place: Path) -> None:
     stated = [part for name, value in options.items() for part in (f"--{name}", value)]
     (made,) = said(place, ["new", "melfa", "--robot", "robot.toml", *files, *stated, "--json"])
     assert json.loads(made)["rows"] == 36
+
+
+def test_a_rule_chooses_the_weight_by_its_name(place: Path) -> None:
+    arm = str(ROOT / "problems" / "paper_arm")
+    (calibrated,) = said(place, ["calibrate", arm, "--selector", "unit", "--json"])
+    assert json.loads(calibrated)["selector"] == "unit"
+    assert "(unit: nearest to one)" in calibrated

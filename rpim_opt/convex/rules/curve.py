@@ -157,3 +157,6 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
         note = "the search ended at an edge: the L-curve has no corner"
     note += skipped(len(seen) - len(order))
     return Selection(float(np.exp(best)), "corner", np.exp(order), menger(points), interior, note)
+
+
+RULES = (l_curve, corner)

@@ -206,3 +206,7 @@ def _of_squares(program: Program) -> Score:
         return total
 
     return lambda weights: np.array([squares(weight) for weight in weights])
+
+
+RULES = (two_step, leave_one_out, k_fold)
+"""All solve without parts of the configurations, which takes long where there is no closed form."""

@@ -166,3 +166,6 @@ def quasi_optimality(program: Program) -> Selection:
         return np.sum((weights[:, None] ** 2 * s2 * beta2) / (s2 + weights[:, None]) ** 4, axis=1)
 
     return linear_rule(program, "quasi_optimality", score, "least change of the solution", local=True)
+
+
+RULES = (reml, gcv, discrepancy, quasi_optimality)

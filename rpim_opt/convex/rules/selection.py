@@ -33,7 +33,8 @@ HOMOGENEOUS = 1e-9
 class Selection(Tabled):
     """A selected weight with its evidence.
 
-    ``name`` is the rule's, ``weights`` and ``score`` (K,) are what it tried and compared; ``interior`` says whether the
+    ``name`` is the rule's, of one that comes with the package that of its function: by it a stored result is calibrated
+    again. ``weights`` and ``score`` (K,) are what it tried and compared; ``interior`` says whether the
     choice lies inside of them, and if not, ``note``, a sentence for the report, what that means.
 
     A selector of one's own is a function of the program that returns a weight, or with its evidence one of these:
