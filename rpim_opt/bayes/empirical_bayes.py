@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -69,7 +70,7 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
             reason = f"its likelihood-ratio statistic is {fall:.1f}; {REQUIRED_GAIN:g} is required."
             notes = (f"The population prior is not used: {reason}",)
     contradicted = tuple(_contradicted(every, estimator, whole, start))
-    fit, trials, gain, outliers = _without_outliers(every, estimator, whole, model)
+    (fit, trials, gain), outliers = _without_outliers(every, estimator, whole, model)
     requested = p.free.names
     if gain > 0:
         problem = problem.with_transmission(fit.problem.robot.model.curves)
@@ -120,39 +121,52 @@ def _contradicted(every: CalibrationProblem, estimator: Estimator, whole: Fit, s
             )
 
 
+class _Explained(NamedTuple):
+    """A fit, the models that were compared, and the gain by transmission errors."""
+
+    fit: Fit
+    trials: tuple[Trial, ...] = ()
+    gain: float = 0.0
+
+
 def _without_outliers(
     every: CalibrationProblem, estimator: Estimator, whole: Fit, model: str
-) -> tuple[Fit, tuple[Trial, ...], float, dict[str, float]]:
-    """Return the fit without outliers, the models compared, the gain by transmission errors, and the outliers."""
+) -> tuple[_Explained, dict[str, float]]:
+    """Return the fit without outliers, and the outliers."""
 
-    def explain(outliers: Mapping[str, float]) -> tuple[Fit, tuple[Trial, ...], float]:
+    def explain(outliers: Mapping[str, float], last: _Explained) -> _Explained:
         fit = whole
+        if last.gain > 0:  # curves that were admitted beside other outliers stay
+            estimated = replace(estimator, curves=last.fit.problem.robot.model.curves, refit=None)
+            rows = last.fit.problem.on(every.data).without(outliers)
+            return last._replace(fit=estimated.fit(rows, last.fit.x, last.fit.point.logs, ROUNDS))
         if outliers:
             fit = estimator.fit(whole.problem.without(outliers), whole.x, None, ROUNDS)
         if model == "geometry":
-            return fit, (), 0.0
+            return _Explained(fit)
         fit, trials = select_model(estimator, fit)
-        return admitted(estimator, fit, every.parameters.free.names, trials) or (fit, trials, 0.0)
+        return _Explained(*(admitted(estimator, fit, every.parameters.free.names, trials) or (fit, trials)))
 
     outliers = outlier_candidates(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
-    fit, trials, gain = explain(outliers)
+    now = explain(outliers, _Explained(whole))
     for _ in range(OUTLIER_SEARCHES):  # what extensions explain, and the worst outliers, stood before the smaller ones
-        if not outliers and not (trials and trials[0].extensions):
+        fit = now.fit
+        if not outliers and not (now.trials and now.trials[0].extensions):
             break
-        if gain > 0:  # a resistant fit with hundreds of coefficients would take up outliers itself
+        if now.gain > 0:  # a resistant fit with hundreds of coefficients would take up outliers itself
             more = isolated(fit.laid.on(every.data), fit.x)
         else:
             more = outlier_candidates(fit.problem.on(every.data), fit.x, fit.laid.parameters.free.scale, fit.spare)
         if not more.keys() - outliers.keys():
             break
         outliers = {**more, **outliers}
-        fit, trials, gain = explain(outliers)
+        now = explain(outliers, now)
     if outliers:
-        left = unexplained(fit.laid.on(every.data), fit.x, fit.covariance, outliers)
+        left = unexplained(now.fit.laid.on(every.data), now.fit.x, now.fit.covariance, outliers)
         if left.keys() != outliers.keys():
             outliers = left
-            fit, trials, gain = explain(outliers)
-    return fit, trials, gain, outliers
+            now = explain(outliers, now)
+    return now, outliers
 
 
 def with_extensions(problem: Source, found: Estimated) -> Source:
