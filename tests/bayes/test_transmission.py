@@ -109,6 +109,9 @@ def test_outliers_that_ripple_hides_are_excluded():
     result = ro.calibrate(spoiled, model="auto")
     assert {row.label for row in result.learned.left_out} == {spoiled.labels[row] for row in rows}
     assert rms(result.errors(others)) < 2 * np.sqrt(3) * NOISE
+    without = ro.calibrate(spoiled.without({spoiled.labels[row] for row in rows}), model="auto")
+    # -2 ln L at both ends, of which each is an optimum to 1e-5 of its slope
+    assert result.learned.value == pytest.approx(without.learned.value, abs=1e-2)
 
 
 def test_beyond_the_measured_angles_the_interval_returns_to_the_prior(rippled):
