@@ -145,7 +145,7 @@ def _without_outliers(
         if model == "geometry":
             return _Explained(fit)
         fit, trials = select_model(estimator, fit)
-        return _Explained(*(admitted(estimator, fit, every.parameters.free.names, trials) or (fit, trials)))
+        return _Explained(*(admitted(estimator, fit, every.parameters.free.names, trials) or (fit, trials, 0.0)))
 
     outliers = outlier_candidates(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
     now = explain(outliers, _Explained(whole))
