@@ -143,6 +143,14 @@ class Dataset(Tabled):
         return tuple(sorted({str(name) for block in self.blocks for name in block.session_names} - {""}))
 
     @property
+    def session(self) -> np.ndarray:
+        """(N,) names of the rows' sessions, ``""`` where none is stated."""
+        session = np.full(len(self), "", dtype=object)
+        for block in self.blocks:
+            session[block.row] = block.session_names
+        return session
+
+    @property
     def temperatures(self) -> Array:
         """The temperatures (N',) [K] of the rows that state one."""
         columns = [block.columns["temperature"] for block in self.blocks if "temperature" in block.columns]
@@ -150,10 +158,7 @@ class Dataset(Tabled):
 
     def by_session(self) -> list[np.ndarray]:
         """Return the configurations (k,) of every session, of those that share one together, and of unnamed rows."""
-        session = np.full(len(self), "", dtype=object)
-        for block in self.blocks:
-            session[block.row] = block.session_names
-        part = _united(_numbered(session), np.arange(len(self)), self.configuration)
+        part = _united(_numbered(self.session), np.arange(len(self)), self.configuration)
         return [np.unique(self.configuration[part == i]) for i in range(part.max() + 1)]
 
     def of_robot(self, robot: str) -> Dataset:

@@ -16,7 +16,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, in_file
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import Columns, csv_text
-from rpim_opt.basics.text import joined
+from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.basics.units import UNITS, split
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, Board, grid_board, on_board, read_board
@@ -27,7 +27,13 @@ from rpim_opt.problem.diagnosis import rows_without_values
 from rpim_opt.problem.multi_robot import NAME
 from rpim_opt.problem.problem import CalibrationProblem, identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, with_poses
-from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
+from rpim_opt.problem.registration.frames import (
+    largest_session,
+    locate,
+    sessions_apart,
+    starting_cameras,
+    starting_parameters,
+)
 from rpim_opt.robot.chain import MOUNT, ORIGIN, RobotSetup, placed, row_origins, same_place
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.formats.urdf import branching_tip
@@ -326,9 +332,12 @@ def _problem_text(
     robot, kind = arm.robot, found.kind
     markers = sorted({marker for block in rows.blocks for marker in block.markers})
     tools = dict.fromkeys(markers, arm.tool)
-    base, how = _base(arm, rows, tools, kind)
+    apart = _apart(arm, rows, tools)
+    base, how = _base(arm, largest_session(rows) if apart else rows, tools, kind)
     parameters = starting_parameters(robot, rows, base, tools)
     names = list(identifiable("auto", robot, parameters, rows))
+    if apart:  # every session has a base of its own: one of all besides would be free
+        names = [name for name in names if frame_of(name) != "base_"]
     if context["chain"] and markers == [""]:
         # fixed joints at the chain's ends, if any, in place of base and tool
         every = [origin for carried in row_origins(robot.model.terms) for origin in carried.origins]
@@ -361,6 +370,7 @@ def _problem_text(
         kind=kind,
         rows=rows,
         how=how,
+        apart=apart,
         markers=markers,
         tool=np.where(np.abs(arm.tool) < 1e-12, 0.0, arm.tool),
         cameras=cameras,
@@ -368,9 +378,23 @@ def _problem_text(
         base=None if base is None else _frame(base),
         mounting=known.get(robot.gravity.direction, list(robot.gravity.direction)),
         followers=[i for i in range(1, len(robot.mdh) + 1) if i - 1 not in robot.leading],
-        identify=_patterns(names, len(robot.mdh)),
+        identify=_patterns(names, len(robot.mdh)) + ["session_*"] * bool(apart),
     )
-    return text, how
+    return text, "\n".join(filter(None, [how, apart]))
+
+
+def _apart(arm: RobotSetup, rows: Dataset, tools: Mapping[str, Array]) -> str:
+    """Say which sessions have a registration of their own; empty without such."""
+    off = sessions_apart(arm.robot, with_poses(rows, starting_cameras(rows, {})), tools)
+    if not off:
+        return ""
+    first, *others = off
+    figures = listed([f"'{name}' {three_digits(1e3 * off[name])} mm" for name in others])
+    return (
+        "Guessed: the instrument or the base was moved between sessions. RMS distance of their points from the nominal "
+        f"robot, registered in session '{first}': {figures}. So session_*, a registration of each, is identified in "
+        "place of base_*, with session_mm = 1000 and session_mrad = 1000 in [scale]."
+    )
 
 
 def _base(arm: RobotSetup, rows: Dataset, tools: Mapping[str, Array], kind: Measurement) -> tuple[Array | None, str]:

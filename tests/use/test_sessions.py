@@ -159,3 +159,29 @@ def test_sessions_that_stand_apart_are_said_to_be_stated_so(arm: ro.study.Simula
     together = ro.calibrate(arm.problem.on(data))
     assert any("session_mm = 1000 and session_mrad = 1000 in [scale]" in cause for cause in together.causes)
     assert result.nominal_errors().max() < 0.02
+
+
+OPPOSITE = numeric_frame([2.0, 1.7, -0.1, 0.01, -0.02, -2.6])  # to the other side of the robot
+
+
+def test_new_registers_sessions_that_stand_apart_by_themselves(
+    arm: ro.study.SimulatedArm, capsys, monkeypatch, tmp_path: Path
+) -> None:
+    """With a base of all besides, U was 11 mm: a motion of all, which the data do not see, is as wide as the prior."""
+    rows = [("near", "far")[i % 2] for i in range(40)]
+    y = arm.problem.data.blocks[0].y
+    y = np.where(np.array(rows)[:, None] == "far", y @ OPPOSITE[:3, :3].T + OPPOSITE[:3, 3], y)
+    cells = [[*q, *p, name] for q, p, name in zip(arm.problem.data.q, y, rows, strict=True)]
+    header = [*(f"q{i}_rad" for i in range(1, 7)), "x_m", "y_m", "z_m", "session"]
+    (tmp_path / "raw.csv").write_text(csv_text(header, cells))
+    ro.robot.write_robot(arm.problem.robot, tmp_path / "arm.toml")
+    cell = tmp_path / "cell"
+    assert run(monkeypatch, "new", str(cell), "--robot", f"{tmp_path}/arm.toml", "--data", f"{tmp_path}/raw.csv") == 0
+    assert "was moved between sessions. RMS distance of their points" in capsys.readouterr().out
+    problem = ro.load(cell).problem
+    names = problem.parameters.free.names
+    assert not {"session_far_x", "session_near_rz"} - set(names)
+    assert not any(name.startswith("base_") for name in names)
+    view = ro.use.in_session(ro.calibrate(problem))
+    assert view.verdict.delivered
+    assert 2 * np.median(np.linalg.norm(view.predict(arm.true.q, of="reached").standard, axis=1)) < 1.5e-4

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.data.dataset import Dataset
@@ -39,6 +39,7 @@ from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, model_parameters, tool_prefix
 
+SETTLED = 6  # rows of a session that determine base and reflector well enough to compare others with them
 ENOUGH = 2000  # rows of a measurement that register frames, where there are more
 
 
@@ -47,8 +48,10 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
 
     They are those of positions and poses on the nominal robot, by `certified_hand_eye`; of several reflectors by that
     with the most poses, or positions, from which the others follow. Where it does not determine the rotations, all
-    positions are fitted with reflectors near where they are stated.
+    positions are fitted with reflectors near where they are stated. Of `sessions_apart` that with the most rows counts.
     """
+    if sessions_apart(robot, data, tools):
+        data = largest_session(data)
     parts = []
     for block in data.blocks:
         if block.measurement.name not in ("position", "pose"):
@@ -108,6 +111,43 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
     if error > UNEXPLAINED * np.linalg.norm(y.std(axis=0)):
         fits = "the nominal robot does not explain the data, RMS error"
     return frame_numbers(base), places, f"{fits} {three_digits(1e3 * error)} mm; {how}"
+
+
+def largest_session(data: Dataset) -> Dataset:
+    """Return the rows of the session with the most rows."""
+    names = data.session
+    return data.take(np.flatnonzero(names == Counter(names.tolist()).most_common(1)[0][0]))
+
+
+def sessions_apart(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> dict[str, float]:
+    """Return the session with the most rows, and those whose instrument or base stood elsewhere; none without these.
+
+    The nominal robot is registered to the first one, with reflectors starting at ``tools``; a session's figure is the
+    RMS distance [m] of its points from there. It stands apart if that is several times what a nominal robot, or the
+    session's own registration, leaves.
+    """
+    here = largest_session(data)
+    blocks = [block for block in data.blocks if block.measurement.name in ("position", "pose")]
+    if not blocks or len(here) not in range(SETTLED, len(data)):
+        return {}
+    try:
+        base, places, _ = locate(robot, here, tools)
+    except InputError:  # its rotations are not determined
+        return {}
+    session, y, modelled = (np.concatenate(each) for each in zip(*(
+        (b.session_names, b.y[:, :3], transformed(forward_kinematics(robot, b.q[:, 0]), places[b.markers[0]][:3]))
+        for b in blocks
+    ), strict=True))  # fmt: skip
+    modelled = transformed(numeric_frame(base), modelled)
+    off = {str(here.session[0]): 0.0}
+    for name in set(session) - set(off):
+        own, there = y[session == name], modelled[session == name]
+        with suppress(InputError):  # too few, or on a line
+            error, alone = there - own, transformed(register(there, own), there) - own
+            far, left = (rms(np.linalg.norm(each, axis=1)) for each in (error, alone))
+            if far > MISPLACED * max(NOMINAL_ERROR, left):
+                off[name] = far
+    return off if len(off) > 1 else {}
 
 
 APART = 0.1
