@@ -20,6 +20,7 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import CONFIDENCE, HeldOut
 from rpim_opt.robot.terms import transmission
 
+APART = 1e4  # variance of an unknown session over a reading's, from which on an interval says nothing
 RARE = 0.01  # probability that data like those of the calibration have any row that is named
 
 
@@ -212,7 +213,8 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
 def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None = None) -> HeldOut:
     """Return the errors of a calibration on measurements that it did not use, beside their prediction intervals.
 
-    The coverage is that of the rows that are ``counted`` (N,), by default all.
+    The coverage is that of the rows that are ``counted`` (N,), by default all. Where sessions stand apart, rows of one
+    that was not measured have no interval.
     """
     N = len(data)
     sigmas, allowed = np.full((2, N), np.nan)
@@ -235,6 +237,7 @@ def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None =
         freedom = row_freedom(result.freedom, sessions_spread(result.learned), S, session)
         squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)
         predicted = (A[:, :, ~known] == 0).all(axis=(1, 2))
+        predicted &= np.einsum("nkk->n", session - APART * (reading - session)) < 0
         sigmas[block.row] = np.where(predicted, np.sqrt(squares), np.nan)
         limit = np.sqrt(k * fdtri(k, freedom, 1 - RARE / N))
         allowed[block.row] = np.where(predicted, limit, np.nan)

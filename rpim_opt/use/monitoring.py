@@ -16,6 +16,7 @@ from rpim_opt.basics.tables import csv_text, records
 from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import noise_covariances
+from rpim_opt.calibration.held_out import unregistered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors
 from rpim_opt.calibration.verdict import misread
@@ -188,11 +189,14 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
         sizes[block.row] = len(block.measurement.components)
     level = recalibration.FALSE_ALARM / TESTS
     sigmas, deviate = _innovations(result, problem, level / count)
+    held = held_out_errors(result, data)
     return Monitoring(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
         allowed=np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - level / count)), sums=cusum(deviate),
         limit=cusum_limit(count, level), drift=_drift(result, problem, level),
-        mistake=misread(result, data) or recalibration.moved_or_changed(result, data, held_out_errors(result, data))[0],
+        mistake=unregistered(result, data, held)
+        or misread(result, data)
+        or recalibration.moved_or_changed(result, data, held)[0],
     )  # fmt: skip
 
 

@@ -447,14 +447,17 @@ def posterior_as_prior(
     free = problem.parameters.free
     x = previous_deviations(result, problem)
     widths = prior_widths(result, problem)
+    known = set(result.problem.parameters.free.names)
     centre, scale = {}, {}
-    for i in [free.names.index(name) for name in released]:
-        unit, si = display(free.dimensions[i])
-        centre[f"{free.names[i]}_{unit}"] = float(x[i]) / si
-        scale[f"{free.names[i]}_{unit}"] = float(MULTIPLES[-1] * widths[i]) / si  # so wide that readings alone decide
+    for i, name in enumerate(free.names):
+        if name in released or name not in known:
+            unit, si = display(free.dimensions[i])
+            centre[f"{name}_{unit}"] = float(x[i]) / si
+            # so wide that readings alone decide; of a new session no narrower than was stated: few showed their scatter
+            width = MULTIPLES[-1] * widths[i] if name in released else max(widths[i], free.scale[i])
+            scale[f"{name}_{unit}"] = float(width) / si
     prior = Prior(centre=centre, scale=scale)
     if len(released) < len(free):
-        known = set(result.problem.parameters.free.names)
         without = tuple(name for name in released if name in known)
         # in units of the declared noise, as the new readings are: weight 1 then joins both
         prior = Prior.from_result(result, inflation, without, noise=1.0) & prior
@@ -467,7 +470,11 @@ def prior_widths(result: Calibration, problem: Source) -> Array:
     free = problem.parameters.free
     learned = result.learned
     stated = {} if learned is None else dict(zip(result.problem.parameters.free.names, learned.stated, strict=True))
-    scale = [stated.get(name, own) for name, own in zip(free.names, free.scale, strict=True)]
+    stated = {
+        name.rpartition("_")[2]: own for name, own in stated.items() if of_session(name)
+    } | stated  # new ones, too
+    keys = [name.rpartition("_")[2] if of_session(name) and name not in stated else name for name in free.names]
+    scale = [stated.get(key, own) for key, own in zip(keys, free.scale, strict=True)]
     return default_widths(replace(free, scale=np.array(scale)))
 
 

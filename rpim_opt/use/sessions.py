@@ -31,7 +31,7 @@ def in_session(result: Calibration, robot: str = "") -> Calibration:
     True
     """
     problem = result.problem
-    names = _sessions(result, robot) if robot in problem.arms else []
+    names = [name for name, again in _sessions(result, robot).items() if again] if robot in problem.arms else []
     if not names or problem.session or not problem.keeps_rows:
         return result
     views = [replace(result, problem=replace(problem, session=name)) for name in names]
@@ -51,12 +51,12 @@ def registered_again(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
     return data, f"Registered again: the measurements were {motion}."
 
 
-def _sessions(result: Calibration, robot: str) -> list[str]:
-    """Return the names of the sessions that are identified, of an update those that it measured."""
+def _sessions(result: Calibration, robot: str) -> dict[str, bool]:
+    """Return the names of the sessions that are identified, and whether they were measured: in an update some were."""
     free = result.problem.parameters.of_robot(robot).free.names
     called = {session_prefix(name): name for name in result.problem.sample().data.sessions}
     prefixes = dict.fromkeys(frame_of(name) for name in free if of_session(name))
-    return [called[prefix] for prefix in prefixes if prefix in called]
+    return {called.get(each, each.removeprefix("session_")[:-1]): each in called for each in prefixes}
 
 
 def _slopes(view: Calibration, robot: str) -> Array:
@@ -91,8 +91,10 @@ def session_notes(result: Calibration, robot: str = "") -> list[str]:
     here = result.problem.session
     if not here:
         return []
-    names = [here, *(name for name in _sessions(result, robot) if name != here)]
-    listed = [f"'{name}' {placed(frame_numbers(base_frame(result, robot, name)))}" for name in names[:FEW]]
+    measured = _sessions(result, robot)
+    names = sorted(measured, key=lambda name: (name != here, not measured[name]))
+    before = {name: "" if again else " (by rows before the update)" for name, again in measured.items()}
+    listed = [f"'{n}'{before[n]} {placed(frame_numbers(base_frame(result, robot, n)))}" for n in names[:FEW]]
     for i, name in enumerate(names[1:FEW] if not result.no_intervals else (), start=1):
         M = base_frame(result, robot) @ np.linalg.inv(base_frame(result, robot, name))
         there = replace(result, problem=replace(result.problem, session=name))

@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import coverage_text
+from rpim_opt.calibration.held_out import coverage_text, unregistered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors
 from rpim_opt.calibration.verdict import implausible, misread, worse_sentence, worse_than_nominal
@@ -165,5 +165,5 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
         touched=touched,
         remarks=tuple(remarks),
         mistake=misread(result, data) or moved or implausible(result, held),
-        no_intervals=result.no_intervals,
+        no_intervals=result.no_intervals or unregistered(result, data, held),
     )

@@ -135,6 +135,25 @@ def test_measurements_from_a_third_place_are_judged_by_the_robots_uncertainty_on
     assert any("Registered again" in remark for remark in found.remarks)
 
 
+def test_a_third_place_is_no_change_of_the_robot_and_says_nothing_of_it_before_it_is_registered(
+    arm: ro.study.SimulatedArm, result: ro.Calibration
+) -> None:
+    """An update took a turn beyond the two places' scatter for theta1; all rows were inside intervals of 2 m."""
+    third = numeric_frame([1.0, 0.2, -0.1, 0.01, 0.02, -2.5])
+    y = arm.read.blocks[0].y[:20] @ third[:3, :3].T + third[:3, 3]
+    data = ro.Dataset.of(arm.read.q[:20], y, NOISE, session=["third"] * 20)
+    found = ro.use.validate(result, data)
+    assert found.coverage is None
+    assert "Where the instrument stood in session 'third' is unknown" in str(found)
+    assert ro.use.monitor(result, data).mistake == found.no_intervals
+    updated = ro.use.update(result, data)
+    assert not updated.changed
+    assert updated.explained
+    notes = ro.use.session_notes(ro.use.in_session(updated.result))
+    for text in ("'third' x", "'near' (by rows before the update) x", "'far' (by rows before the update) x"):
+        assert text in notes[0]
+
+
 def test_joint_torques_go_with_the_configurations(tmp_path: Path) -> None:
     """Compliances of measured torques bend the arm where it was measured, also when sessions are compared."""
     shutil.copytree(ROOT / "problems" / "joints", tmp_path, dirs_exist_ok=True)
