@@ -80,7 +80,7 @@ class Compensation:
     orientations are not corrected; ``source`` names the calibration. ``beside`` (N,) [m] is how far a stated position
     is from that of the nominal robot at the joint values stated beside it, NaN where there are none. ``after_motion``
     is the RMS of uncorrected position errors [m] that one motion of all targets leaves, NaN for fewer than `MOVED` of
-    them or targets on a line.
+    them or targets on a line; ``std_after_motion`` that of standard uncertainties.
     """
 
     robot: Robot
@@ -101,6 +101,7 @@ class Compensation:
     limit: float = np.inf
     source: str = ""
     after_motion: float = np.nan
+    std_after_motion: float = np.nan
 
     def __str__(self) -> str:
         figures = []
@@ -126,6 +127,12 @@ class Compensation:
             f"base{moved if self.after_motion < rms(self.position_before) / 2 else ''}; nominal errors in a report "
             "refer to a refitted base and tool.",
         ]
+        if self.std_after_motion < rms(self.std) / 2:
+            whole, left = (f"{1e3 * EXPANDED * each:.4f} mm" for each in (rms(self.std), self.std_after_motion))
+            lines.append(
+                f"Of the expanded uncertainty (k = 2), {whole} RMS, a common motion of all targets makes the most: the "
+                f"calibration hardly determines where the robot's base is. Relative to each other it is {left} RMS."
+            )
         at_fault = {UNREACHABLE: " in the robot's base frame", ABOVE: f" of {1e3 * self.limit:g} mm"}
         for status, where in {"limited": "", "near singular": "", **at_fault}.items():
             rows = [f"{self.label[i]} ({self._left(i)})" for i, each in enumerate(self.status) if each == status]
@@ -197,6 +204,7 @@ class Compensation:
             "nominal": errors(self.position_before, self.orientation_before),
             "corrected": errors(self.position_error, self.orientation_error),
             "largest_corrections": self._largest_corrections(),
+            "std_after_motion_mm": 1e3 * self.std_after_motion,
             "missed": self.missed,
             "outside": [self.label[i] for i in self.outside.rows],
             "rows": records(self._columns()),
@@ -370,6 +378,9 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
         with suppress(InputError):
             left = targets_at - transformed(register(there, targets_at), there)
             fields["after_motion"] = rms(np.linalg.norm(left, axis=1))
+            few = slice(None, None, -(-len(there) // BLOCK))
+            some = Targets._make(None if each is None else each[few] for each in targets)
+            fields["std_after_motion"] = rms(cell.uncertainty(fields["q"][few], some, there[few])[0])
     return fields, why
 
 
@@ -556,8 +567,11 @@ class _Cell(NamedTuple):
         fields["std"], fields["orientation_std"] = self.uncertainty(corrected, targets)
         return fields
 
-    def uncertainty(self, q: Array, targets: Targets) -> tuple[Array, Array]:
-        """Return sqrt(tr (J C J' + R)) (N,) of position [m] and orientation [rad] reached at q, under their loads."""
+    def uncertainty(self, q: Array, targets: Targets, moved: Array | None = None) -> tuple[Array, Array]:
+        """Return sqrt(tr (J C J' + R)) (N,) of position [m] and orientation [rad] reached at q, under their loads.
+
+        Of positions, what one motion of all of them leaves, where they are ``moved`` (N, 3) with it.
+        """
         N, k = len(q), len(self.kind.components)
         if self.spread is None:
             return self.norms(np.full((N, k), np.inf))
@@ -565,6 +579,11 @@ class _Cell(NamedTuple):
         problem = self.problem.measuring(q, self.kind, self.marker, *loads, covariance=self.noise)
         J = np.zeros((N, k, len(self.spread.z)))
         J[:, :, self.own] = problem.jacobian(self.x).reshape(N, k, -1)
+        if moved is not None:
+            motions = np.concatenate([np.tile(np.eye(3), (N, 1, 1)), np.cross(moved[:, None], np.eye(3))], axis=2)
+            Q = np.linalg.qr(motions.reshape(3 * N, 6))[0]
+            of_positions = J[:, :3].reshape(3 * N, -1)
+            J[:, :3] = (of_positions - Q @ (Q.T @ of_positions)).reshape(N, 3, -1)
         position_and_turn = (self.spread.of_positions(J[:, i : i + 3]) for i in range(0, k, 3))
         variance = np.hstack([np.einsum("nkk->nk", C) for C in position_and_turn])
         variance += np.einsum("nkk->nk", noise_covariances(problem, self.level).robot[0])

@@ -615,6 +615,19 @@ def test_a_limit_holds_for_what_is_left_and_its_uncertainty() -> None:
     assert "the reflector's" not in str(ro.use.compensate(stated, q, tool=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
 
 
+def test_a_common_motion_of_all_targets_is_told_from_what_is_uncertain_beside_it() -> None:
+    """Distances do not show where the base is: U was 5 mm, unsaid that targets are right to 0.1 mm among themselves."""
+    instance = ro.load("distance")
+    q = instance.validation.blocks[0].q[:30, 0]
+    found = ro.use.compensate(ro.calibrate(instance.problem, ro.tikhonov, 1.0), q, marker="A")
+    std = np.sqrt(np.mean(found.std**2))
+    assert found.std_after_motion < std / 20
+    text = f"Relative to each other it is {2e3 * found.std_after_motion:.4f} mm RMS."
+    assert f"{2e3 * std:.4f} mm RMS, a common motion of all targets makes the most" in str(found)
+    assert text in str(found)
+    assert "Relative to each other" not in str(ro.use.compensate(calibrated()[0], commands(ARM, 30)))
+
+
 def test_orientations_have_no_uncertainty_where_they_do_not_count() -> None:
     found = ro.use.compensate(calibrated()[0], commands(ARM, 2), orientation=False)
     assert np.isnan(found.orientation_std).all()
