@@ -458,7 +458,8 @@ def _held_out(
     """Return the test of a limit by held-out rows: a document [mm] or None, rows beyond it, and what is missing."""
     found = _rows_apart(result, data)
     if found is None:
-        used = "" if data is None else f"; all {len(data)} rows of the table are identification rows"
+        used = "; an update identifies from all rows that it reads" * bool(result.record.earlier)
+        used = used if data is None else f"; all {len(data)} rows of the table are identification rows"
         return None, [], [f"Missing: held-out rows (`new --hold-out`, or a table for `accept --data`){used}."]
     apart, held, excluded, moved = found
     kept = ~np.isin(held.label, excluded)

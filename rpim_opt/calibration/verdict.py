@@ -363,7 +363,7 @@ def likely_causes(result: Outcome) -> list[str]:
     >>> result = ro.calibrate(problem.on(replace(problem.data, blocks=(wrong,))), ro.tikhonov, weight=1.0)
     >>> causes = ro.calibration.likely_causes(result)
     >>> causes[1].partition(" with ")[2]
-    'joints 2 and 3 exchanged: exchange the names of the columns q2 and q3.'
+    'joints 2 and 3 exchanged: exchange the columns of joints 2 and 3.'
     """
     known = [] if result.learned is None else list(result.learned.contradicted)
     if not result.problem.keeps_rows:

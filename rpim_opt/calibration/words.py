@@ -103,6 +103,9 @@ def sentences(result: Outcome, verdict: Verdict) -> list[str]:
 
 def noise_sentence(result: Outcome) -> str:
     """Return the noise test as a sentence, or why there is none."""
+    if result.contradiction and not result.no_intervals:
+        ratio = result.noise_test().ratio
+        return f"Residuals are {ratio:.2f} times the measurement noise, with constraints that the data contradict."
     return result.no_intervals or result.noise_test().verdict
 
 

@@ -648,7 +648,7 @@ def _turned_joint(problem: CalibrationProblem, out: Points, fit: Fit, limit: flo
             named = _rows(problem.data, out.row[explained], "has", "have")
             off = np.abs(np.degrees(np.angle(np.exp(1j * (q - out.q)[explained, i]))))
             by = f"{off.min():.1f} to {off.max():.1f} deg"
-            said = f"{named} wrong values of joint {i + 1}, by {by}, which explain the errors: correct column q{i + 1}"
+            said = f"{named} wrong values of joint {i + 1}, by {by}, which explain the errors: correct its column"
     if said:
         yield f"{said}, or leave them out ([exclude])."
 

@@ -41,8 +41,8 @@ MISTAKES = {False: 3, True: 1}
 COUPLINGS = {True: (1.0, -1.0, 0.5, -0.5), False: (1.0, -1.0)}
 """How much of another joint a joint may count, of a neighbour and of others."""
 LENGTHS = {
-    1e3: ("a thousand times larger", "name the columns x_m, y_m, z_m"),
-    1e-3: ("a thousand times smaller", "name the columns x_mm, y_mm, z_mm"),
+    1e3: ("a thousand times larger", "name the columns x_m, y_m, z_m, or multiply an array by 1000"),
+    1e-3: ("a thousand times smaller", "name the columns x_mm, y_mm, z_mm, or divide an array by 1000"),
     25.4: ("in inches, not mm", "name the columns X [in], ... and use rpim-opt new"),
     10.0: ("in cm, not mm", "name the columns X [cm], ... and use rpim-opt new"),
     1e-2: ("in cm, not m", "name the columns X [cm], ... and use rpim-opt new"),
@@ -52,8 +52,14 @@ LENGTHS = {
 }
 """Factors between units of lengths, what was read wrongly, and what to write."""
 ANGLES = {
-    np.pi / 180: ("as degrees, not radians", "name the columns q1_deg, ... (--units deg)"),
-    180 / np.pi: ("as radians, not degrees", "name the columns q1_rad, ... (--units rad)"),
+    np.pi / 180: (
+        "as degrees, not radians",
+        "name the columns q1_deg, ... (--units deg), or convert an array to radians",
+    ),
+    180 / np.pi: (
+        "as radians, not degrees",
+        "name the columns q1_rad, ... (--units rad), or leave out np.radians of an array",
+    ),
     0.9: ("as gon, not degrees", "multiply the joint values by 0.9"),
     360.0: ("as turns, not degrees", "multiply the joint values by 360"),
     1e-3: ("as thousandths of a degree", "divide the joint values by 1000"),
@@ -145,10 +151,9 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
         yield _joints(f"joint values read {unit}", remedy, np.diag(np.where(turning, factor, 1)))
     for (factor, (unit, _)), (i, j) in product(list(ANGLES.items())[:2], combinations(range(robot.dof + 1), 2)):
         if turning[i:j].all() and j - i < robot.dof:  # one joint, or several next to each other
-            number, several = [str(k + 1) for k in range(i, j)], "s" * (j - i > 1)
-            remedy = f"multiply column{several} {joined([f'q{k}' for k in number])} by {factor:.6g} or name the unit"
-            what = f"joint{several} {joined(number)} read {unit}"
-            yield _joints(what, remedy, eye + (factor - 1) * np.diag(eye[i:j].sum(axis=0)))
+            turned = f"joint{'s' * (j - i > 1)} {joined([str(k + 1) for k in range(i, j)])}"
+            remedy = f"multiply the values of {turned} by {factor:.6g} or name the unit"
+            yield _joints(f"{turned} read {unit}", remedy, eye + (factor - 1) * np.diag(eye[i:j].sum(axis=0)))
     if not turning.all():
         for factor, (unit, _) in LENGTHS.items():
             remedy = f"multiply the columns of the linear joints by {factor:g} or name their unit"
@@ -157,8 +162,8 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
         flipped = eye - 2 * np.outer(eye[i], eye[i])
         sign = -int(signs(robot.joint_map)[i])
         yield _joints(f"joint {i + 1} reversed", f"write sign = {sign} for joint {i + 1} in robot.toml", flipped)
-        remedy = f"check its brake and column q{i + 1}"
-        yield _joints(f"joint {i + 1} standing still in all rows", remedy, eye - np.outer(eye[i], eye[i]))
+        what = f"joint {i + 1} standing still in all rows"
+        yield _joints(what, "check its brake and its column", eye - np.outer(eye[i], eye[i]))
     for i in range(1, robot.dof - 1):
         remedy = f"put it on the last link, or describe the robot up to joint {i}"
         before = np.diag(np.arange(robot.dof) < i).astype(float)
@@ -168,7 +173,7 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
         exchanged[[i, j]] = eye[[j, i]]
         if turning[i] != turning[j]:  # degrees were read as millimetres, and these as degrees
             exchanged *= np.where(turning, DEGREES_PER_MM, 1 / DEGREES_PER_MM)[:, None] ** (eye[i] + eye[j])[:, None]
-        remedy = f"exchange the names of the columns q{i + 1} and q{j + 1}"
+        remedy = f"exchange the columns of joints {i + 1} and {j + 1}"
         yield _joints(f"joints {i + 1} and {j + 1} exchanged", remedy, exchanged)
     for i, j in permutations(np.flatnonzero(turning), 2):
         for factor in COUPLINGS[bool(abs(i - j) == 1)]:
@@ -339,8 +344,8 @@ def _of_rows(count: int, dof: int) -> Iterator[Misreading]:
         remedy = f"move the measured values {rows} {back}, against the joint values"
         yield Misreading(what, remedy, partial(_slipped, slice(None), -k * by))
     for i, (by, low, back) in product(range(dof), SLIPPED):
-        what = f"column q{i + 1} one row too {low} in the table"
-        yield Misreading(what, f"move column q{i + 1} one row {back}", partial(_slipped, i, by))
+        what = f"the values of joint {i + 1} one row too {low} in the table"
+        yield Misreading(what, f"move the column of joint {i + 1} one row {back}", partial(_slipped, i, by))
     by_text = np.array(sorted(range(count), key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
     for what, how, order in (
@@ -359,7 +364,7 @@ def _factors(points: Points) -> Iterator[Misreading]:
     """Yield readings with a column, all angles or all lengths times a factor that fits: other units, counts, gears."""
     robot = points.robot
     eye = np.eye(robot.dof)
-    scaled = {f"column q{i + 1}": ("q", eye[i]) for i in range(robot.dof)}
+    scaled = {f"values of joint {i + 1}": ("q", eye[i]) for i in range(robot.dof)}
     turning = np.array(robot.joint_dimensions) == "angle"
     scaled |= {"all joint values": ("q", turning), LENGTHS_OF_ALL: ("y", np.ones(points.y.shape[1]))}
     if not points.lengths:

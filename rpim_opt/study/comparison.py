@@ -27,6 +27,7 @@ from rpim_opt.study.methods import METRICS, UNDELIVERED, methods_of, metrics_of,
 USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")  # metrics of a comparison that states none
 MOST_DRAWS = 100_000  # each is a calibration of its own, and is listed before the first begins
 LARGEST = float(np.finfo(float).max)  # whole numbers may be larger than any double
+PEAKED = 3.0  # RMS over mean error above which few rows make it; 1.09 of normal errors
 TIE = 0.01  # errors that differ by no more than this part are a tie
 ENOUGH = 5  # problems from which on an interval speaks of problems like them; with fewer, of these
 BOOTSTRAP_DRAWS = 4000
@@ -451,6 +452,16 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         yield text
     elif len(standings) > 1:
         yield f"There are no intervals: fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one."
+    peaks: dict[Pair, list[float]] = {}
+    for row in rows:
+        if row.get("rms_mm") and row.get("mean_mm"):
+            peaks.setdefault(tuple(row[name] for name in SAME_DATA), []).append(row["rms_mm"] / row["mean_mm"])
+    peaked = list(dict.fromkeys(pair[0] for pair, each in peaks.items() if min(each) > PEAKED))
+    if peaked:
+        yield (
+            f"On {listed(peaked, 4)} the RMS error is above {PEAKED:g} times the mean with every method: few held-out "
+            "rows make it. Leave out those that are outliers, or compare by mean_mm."
+        )
     every = Counter(row["method"] for row in rows)
     without: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:

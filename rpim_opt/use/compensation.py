@@ -316,6 +316,8 @@ def compensate(
         raise InputError("payload", "a payload without effect on the model", WEIGHED)
     whole, why = _corrected(cell, targets, largest, orientation)
     point = cell.point + why
+    if oriented and not turns_measured(cell.problem):
+        point += " Positions of one reflector determine only part of an orientation, the prior the rest."
     expanded = EXPANDED * np.nan_to_num(whole["std"], posinf=0.0)
     above = (whole["position_error"] + expanded > limit) & (whole["status"] != UNREACHABLE)
     reached = Dataset.of(whole["q"], np.zeros((len(expanded), 3)), 1.0)
@@ -382,6 +384,12 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
             some = Targets._make(None if each is None else each[few] for each in targets)
             fields["std_after_motion"] = rms(cell.uncertainty(fields["q"][few], some, there[few])[0])
     return fields, why
+
+
+def turns_measured(problem: CalibrationProblem) -> bool:
+    """Return whether orientations were measured, or several reflectors, which show them."""
+    several = len(reflectors(problem.parameters.names)) > 1
+    return several or any(block.measurement.turning for block in problem.data.blocks)
 
 
 def tool_uncertainty(result: Calibration, q: Array, tool: Array | None, marker: str, robot: str) -> tuple[Array, Array]:

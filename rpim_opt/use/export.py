@@ -38,7 +38,7 @@ from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame, numer
 from rpim_opt.robot.library import robots
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
-from rpim_opt.use.compensation import tool_uncertainty
+from rpim_opt.use.compensation import tool_uncertainty, turns_measured
 from rpim_opt.use.sessions import base_frame, in_session, session_notes
 
 OF_BYTES = "surrogateescape"  # files of other tools keep their encoding
@@ -369,8 +369,11 @@ def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: 
         return []
     if not np.isfinite([position, turn]).all():
         return ["URDF: the pose of its tip link is undetermined: check position and orientation by other means."]
-    seen = len(reflectors(problem.parameters.names)) > 1 or any(block.measurement.turning for block in blocks)
-    rests = "" if seen else ". Positions of one reflector determine only part of its pose, the prior the rest"
+    rests = (
+        ""
+        if turns_measured(problem)
+        else ". Positions of one reflector determine only part of its pose, the prior the rest"
+    )
     measured = ""
     if tool is not None:
         measured = f"the reflector {2e3 * tool_uncertainty(result, q, None, name, robot)[0].max():.2g} mm, "
@@ -515,7 +518,7 @@ def noted(content: bytes, ending: str, notes: Sequence[str]) -> bytes:
         cells = [note, *[""] * len(rows)]
         text = csv_text([*header, "note"], [[*row, cell] for row, cell in zip(rows, cells, strict=False)])
     elif ending in (".urdf", ".xml"):
-        note = re.sub("-+", "-", note)
+        note = re.sub("-+", "-", re.sub(r"--+(?=\w)", "option ", note))  # a comment may not contain two hyphens
         text = re.sub(r"(?s)(<\?xml.*?\?>\s*)?", lambda declared: f"{declared[0]}<!-- {note} -->\n", text, count=1)
     else:
         text = "".join(f"# {each}\n" for each in notes) + text

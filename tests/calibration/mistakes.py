@@ -245,7 +245,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     "tracker moved by 1 mm": (moved_by(1e-3), "from row P2"),
     "joint 5 in radians": (of_joint(4, np.radians), "joint 5 read as radians, not degrees"),
     "joints in turns": (joints(lambda q: q / 360), "as turns, not degrees"),
-    "column q1 a row too low": (of_joint(0, lambda q: np.roll(q, 1)), "column q1 one row too low"),
+    "column q1 a row too low": (of_joint(0, lambda q: np.roll(q, 1)), "the values of joint 1 one row too low"),
     "joint 5 frozen": (of_joint(4, lambda q: 0 * q + 0.3), "the values of joint 5 explain nothing"),
     "joint 2 frozen halfway": (
         of_joint(1, lambda q: np.where(np.arange(COUNT) < 20, q, q[20])),

@@ -232,6 +232,7 @@ def moved(data: ro.Dataset, rows: list[int], by: float) -> ro.Dataset:
     ("change", "said"),
     [
         (lambda r: replace(r, record=ro.data.Record()), "Missing: held-out rows"),
+        (lambda r: ro.use.update(r, r.record.validation).result, "an update identifies from all rows that it reads."),
         (
             lambda r: replace(r, record=replace(r.record, validation=r.record.validation.take(range(3)))),
             "at least 5 held-out rows",
@@ -310,6 +311,7 @@ def test_a_drawing_that_the_data_contradict_accepts_no_robot(instance, loss) -> 
         result = ro.calibrate(instance.problem, stated)
         assert bool(result.contradiction) == contradicted
         assert ("The data contradict constraints" in str(result)) == contradicted
+        assert ("times the measurement noise, with constraints that" in str(result)) == contradicted  # no repeatability
         assert ("Delivered under a condition. The data contradict" in str(result.verdict)) == contradicted
         leading = summary(result, {})["headline"]
         assert leading.startswith("Delivered under a condition") == contradicted, leading  # of no pendant

@@ -391,7 +391,7 @@ def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
     for command, code in (("inspect", 1), ("calibrate", 1)):
         assert run(monkeypatch, command, str(tmp_path / "cell"), *more[command]) == code
         said = " ".join(capsys.readouterr().out.split())
-        assert "joints 2 and 3 exchanged: exchange the names of the columns q2 and q3" in said
+        assert "joints 2 and 3 exchanged: exchange the columns of joints 2 and 3" in said
         assert "mm instead of" in said
     assert run(monkeypatch, "report", out) == 0
     assert "joints 2 and 3 exchanged" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
@@ -533,7 +533,7 @@ def test_a_zero_that_is_off_by_degrees_is_calibrated(monkeypatch, tmp_path) -> N
 def test_a_column_that_slipped_is_named_with_rows_held_out(monkeypatch, capsys, tmp_path) -> None:
     made(monkeypatch, tmp_path, IN_TABLES["column q1 a row too low"][0](simulated_arm("ur5e")), "--hold-out", "0.25")
     assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 1
-    assert "column q1 one row too low in the table" in capsys.readouterr().out
+    assert "the values of joint 1 one row too low in the table" in capsys.readouterr().out
 
 
 def test_computed_positions_are_not_delivered_rounded_either(monkeypatch, capsys, tmp_path) -> None:

@@ -269,7 +269,7 @@ def test_a_board_that_is_never_in_sight_is_said(monkeypatch) -> None:
         ),
         pytest.param(
             lambda b: replace(b, q=b.q[:, :, [0, 2, 1, 3, 4, 5]]),
-            "exchange the names of the columns q2 and q3",
+            "exchange the columns of joints 2 and 3",
             marks=pytest.mark.slow,
         ),
         (lambda b: replace(b, q=np.radians(b.q)), "q1_rad"),

@@ -37,7 +37,7 @@ MISTAKES = {
     "a column a row too high": (
         "position",
         {"q": lambda q: np.concatenate([np.roll(q[..., :1], -1, axis=0), q[..., 1:]], axis=-1)},
-        "move column q1 one row down",
+        "move the column of joint 1 one row down",
     ),
     "a frame flipped": ("markers", {"y": lambda y: y * [1, -1, 1]}, "mirrored"),
 }

@@ -140,6 +140,7 @@ def test_orientation_is_corrected_where_it_is_known_better_than_nominally() -> N
     there = ro.use.compensate(result, q, poses)  # the nominal command is still that of the whole pose
     assert np.abs(there.nominal - q).max() < 1e-6
     sure, place = calibrated()[0], ro.use.compensate(calibrated()[0], q)
+    assert "determine only part of an orientation, the prior the rest" in place.point
     assert rms(place.orientation_std) < rms(place.orientation_before)
     assert np.array_equal(place.q, ro.use.compensate(sure, q, orientation=True).q)
 
