@@ -609,18 +609,14 @@ def _inverse_root(covariance: Array) -> Array:
 def near_parallel(robot: Robot) -> tuple[str, ...]:
     """Return the Hayati parameters that a robot needs: ``beta{i}`` if the axes of joints i and i+1 are near parallel.
 
-    Two parallel revolute axes have no single common normal: d and theta then change without bound under a small
-    tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). None where the origins of a URDF's
-    joints are identified.
+    Parallel axes, turning or sliding, have no single common normal: d and theta then change without bound under a
+    small tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). None where the origins of a
+    URDF's joints are identified.
     """
     if row_origins(robot.model.terms):
         return ()
-    return tuple(
-        f"beta{i}"
-        for i in range(1, len(robot.mdh))
-        if abs(np.sin(robot.mdh[i, 0])) < np.sin(NEAR_PARALLEL)
-        and robot.joint_types[i - 1 : i + 1] == ("revolute",) * 2
-    )
+    parallel = np.abs(np.sin(robot.mdh[1:, 0])) < np.sin(NEAR_PARALLEL)
+    return tuple(f"beta{i}" for i in np.flatnonzero(parallel) + 1)
 
 
 def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, data: Dataset) -> Iterable[str]:

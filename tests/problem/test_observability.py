@@ -85,4 +85,16 @@ def test_hayatis_parameter_is_proposed_where_axes_are_parallel() -> None:
     assert near_parallel(ro.read_robot(find_robot("irb120"))) == ("beta2",)
     assert near_parallel(ro.read_robot(find_robot("iiwa14"))) == ()
     scara = ro.load("scara").problem.robot
-    assert near_parallel(scara) == ("beta1",)
+    assert near_parallel(scara) == ("beta1", "beta2", "beta3")  # a slide has a direction, too
+
+
+def test_tilts_of_a_slide_are_identified_by_default() -> None:
+    """Of the axis before a stroke, and of the one behind it: a milliradian is 0.2 mm over the stroke."""
+    problem, rng = ro.load("scara").problem.identify("auto"), np.random.default_rng(3)
+    names = problem.parameters.free.names
+    truth = np.array([1e-3 * rng.normal() if name.startswith(("alpha", "beta")) else 0.0 for name in names])
+    (y,) = problem.modelled(truth)
+    data = ro.Dataset.of(problem.data.q, y + 2e-5 * rng.normal(size=y.shape), 2e-5)
+    result = ro.calibrate(problem.on(data), ro.tikhonov, 1.0)
+    assert {"beta2", "beta3"} <= set(names)
+    assert result.errors().mean() < 5e-5  # without beta2 and beta3 more is left
