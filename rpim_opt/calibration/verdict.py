@@ -477,7 +477,7 @@ def _held(result: Outcome, problem: CalibrationProblem) -> list[str]:
     held = ~p.identified & (p.placed | np.isin([name.rstrip("0123456789") for name in p.names], MDH))
     groups = [name if frame_of(name) == "_" else f"{frame_of(name)}*" for name in np.array(p.names)[held].tolist()]
     before = min(rms(problem.errors(x)) for x in (own, ridge_deviations(problem)))  # whatever limits the result
-    best, said = min(now, ELSEWHERE * before), ""
+    best, said = min(now, ELSEWHERE * before, REACH * arm_length(problem)), ""
     for group in dict.fromkeys(groups):
         freed = problem.identifying(p.identified | [fits(name, group) for name in p.names])
         located = fitted_frames(freed)[0].parameters
@@ -556,11 +556,14 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
     """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some."""
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
         return list(diagnosis.rows_without_values(problem.data, problem.arms))
-    error = rms(problem.errors(result.x)[kept_rows(result)])
+    kept = kept_rows(result)
+    error = rms(problem.errors(result.x)[kept])
     beyond = error >= LARGEST["length"]  # what a robot's own effects may be
+    explained = max(ratio for _, ratio in residual_rms(result, kept).values()) < NOTICED
+    most = REACH * arm_length(problem) if explained else np.inf  # else wrong lengths explain more
     # beside single rows, which may be the ones where something changed
     return first(
-        chain(diagnosis.single_rows(ordered), diagnosis.other_readings(ordered)),
+        chain(diagnosis.single_rows(ordered), diagnosis.other_readings(ordered, most)),
         _shown_without_outliers(result, ordered),
         diagnosis.rounded(problem, error),
         diagnosis.odd_column(problem) if beyond else (),

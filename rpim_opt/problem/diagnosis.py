@@ -65,6 +65,7 @@ COMPUTED = "were they computed, not measured? Leave them out ([exclude])."
 MOSTLY = 2 / 3  # share of the rows from one to another that is of one kind, for a change to have come there
 TWO_KINDS, STARTS = 0.4, 30
 """Rows are of two kinds if two calibrations leave less than this part of the residuals of one; starts of the search."""
+SCATTERED = 5.0  # residuals of rows over those of the others from which on they are of another kind
 OUTLYING, OUTLYING_ROUNDS = 10, 3
 """One of so many rows may be an outlier of the one calibration; rounds in which these are found."""
 TOGETHER, CHANCE_RUNS = 4, 0.05
@@ -408,6 +409,12 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     pairs = [f"{label[i]} and {label[j]}" for i, j in other.items() if i < j and other.get(j) == i]
     if pairs:
         yield f"the measured values of rows {listed(pairs)} fit each other's joint values: exchange them."
+    copied = [f"{label[i]} ({label[j]})" for i, j in other.items() if (points.y[i] == points.y[j]).all()]
+    if copied:
+        yield (
+            f"rows {listed(copied)} have the measured values of the rows in brackets to the last digit, and do not "
+            "fit their own joint values: were they pasted twice? Measure them again, or leave them out ([exclude])."
+        )
     for by in (1, -1):
         shifted = [label[i] for i, j in other.items() if j - i == by]
         if len(shifted) >= FEWEST and len(shifted) > len(far) / 2:
@@ -507,10 +514,11 @@ def _values_that_fit(points: Points, joint: int, known: Fit | None = None) -> Ar
     return q
 
 
-def other_readings(problem: CalibrationProblem) -> list[str]:
+def other_readings(problem: CalibrationProblem, most: float = np.inf) -> list[str]:
     """Return what explains a table better than it is stated: another place or interpretation of some rows, or of all.
 
-    Where half of the rows agree with the nominal robot, another interpretation is sought of the others first.
+    Where half of the rows agree with the nominal robot, another interpretation is sought of the others first. One of
+    all rows leaves errors of at most ``most`` [m] by the nominal robot.
     """
     points = points_of(problem) or lengths_of(problem)
     if points is None:
@@ -518,7 +526,7 @@ def other_readings(problem: CalibrationProblem) -> list[str]:
 
     def of_all() -> Iterator[str]:
         better = better_reading(problem)
-        if better is not None:
+        if better is not None and better.left <= most:
             yield better.sentence
 
     both = [of_all(), other_rows(problem)]
@@ -733,9 +741,9 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
     of a joint zero from a value of the joint on as well, and of a reflector by the direction of gravity at the flange;
     the slope of a joint's zero times the value of a joint, all of these times the way from the row
     before, and the slopes of the scale or offset of lengths, of positions by the scales and skews of their axes, too.
-    Else backlash, rows of two kinds and noise of one column are looked for. Nothing is reported where gravity and
-    eccentric gears explain more, which are not in the model: a lack of fit, and no mistake. With ``most`` the addition
-    is reported if it leaves at most that part of the squares, and nothing else is looked for.
+    Else backlash, rows of two kinds, noise of one column and of some rows are looked for. Nothing is reported where
+    gravity and eccentric gears explain more, which are not in the model: a lack of fit, and no mistake. With ``most``
+    the addition is reported if it leaves at most that part of the squares, and nothing else is looked for.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
@@ -771,7 +779,8 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
     else:
         said = [_said_of_kinds(problem, rows, part)] if kinds else ()
         noise = _uneven_noise(problem, x) if acceptable == 1 else ()  # else errors are too large for noise
-        yield from first(two_positions(problem, x, min(limit, part / MOVED) if kinds else limit), said, noise)
+        backlash = two_positions(problem, x, min(limit, part / MOVED) if kinds else limit)
+        yield from first(backlash, said, noise, scattered_rows(problem, x))
 
 
 def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[str]:
@@ -965,6 +974,34 @@ def _uneven_noise(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         )
 
 
+def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
+    """Report rows that scatter far more than the others, if these agree with the stated noise without them.
+
+    The rows of a fit of Huber's loss, then of those within `NOISY` times the stated noise, found in turn.
+    """
+    model, owners, N = problem.linearize(x), problem.owners, len(problem.data)
+    A, b, count = model.A, model.b, np.maximum(np.bincount(owners, minlength=N), 1)
+    weight, error = np.ones(N), np.ones(N)
+    for k in range(2 * MOST_ROUNDS):
+        w = weight[owners]
+        z = np.linalg.solve((A.T * w) @ A + np.eye(A.shape[1]), A.T @ (w * b))
+        error = np.sqrt(np.bincount(owners, (b - A @ z) ** 2, N) / count)
+        weight = 1 / np.maximum(error, 1) if k < MOST_ROUNDS else (error < NOISY).astype(float)
+    kept = weight > 0
+    spare = count[kept].sum() - _freedom(model)
+    if np.count_nonzero(~kept) < FEW or spare < _freedom(model):
+        return
+    size = float(np.sqrt(np.sum(count[kept] * error[kept] ** 2) / spare))
+    times = rms(error[~kept]) / max(size, 1.0)
+    if size < NOTICED and times > SCATTERED:
+        rows = joined([problem.data.label[i] for i in np.flatnonzero(~kept)])  # all, as they are to be left out
+        yield (
+            f"rows {rows} scatter {three_digits(times)} times as much as the others, which agree with the stated "
+            "noise: was the reflector loose in its nest, or the arm not at rest? Measure them again, or leave them out "
+            "([exclude])."
+        )
+
+
 def _said_of_kinds(problem: CalibrationProblem, rows: np.ndarray, left: float) -> str:
     """Return the sentence on rows of two kinds; whether the smaller one agrees with the nominal robot."""
     named, label = _rows(problem.data, rows, "fits", "fit"), problem.data.label
@@ -984,7 +1021,7 @@ def _said_of_kinds(problem: CalibrationProblem, rows: np.ndarray, left: float) -
 def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterator[str]:
     """Report one or two joints that explain residuals at x (n,) if each is at either of two positions in every row.
 
-    They leave less than a part ``most`` of them.
+    They leave less than a part ``most`` of them, two joints half of what one does at most.
     The parameters are fitted beside, with their prior. Random errors leave 60 % of the residuals, as their signs are
     fitted then and not their sizes, and much less where there are fewer than three equations a parameter.
     """
@@ -996,7 +1033,7 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
     without = _without_parameters(model)
     joints = [(i, free.names.index(name)) for i, name in enumerate(_zeros(problem.robot), 1) if name in free.names]
     joints = [(i, k) for i, k in joints if model.A[:, k].any()]
-    best, said = most, ""
+    best, alone, said = most, np.inf, ""
     for some in [*combinations(joints, 1), *combinations(joints, 2)]:
         numbers = [k for _, k in some]
         A = columns = model.A[:, numbers]
@@ -1010,8 +1047,10 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
             step = np.linalg.lstsq(without(columns), without(r[:, None])[:, 0], rcond=None)[0]
             target = without((r - columns @ step)[:, None])[: len(r), 0] + columns @ step
         left = float(np.linalg.norm(target - columns @ step) / np.linalg.norm(r))
+        if len(some) == 1:
+            alone = min(alone, left)
         apart = 2e3 * np.abs(step) * free.scale[numbers]
-        if left < best and apart.min() >= 1e3 * LOOSE:
+        if left < (best if len(some) == 1 else min(best, MOVED * alone)) and apart.min() >= 1e3 * LOOSE:
             best = left
             units = ["mrad" if free.dimensions[k] == "angle" else "mm" for k in numbers]
             steps = [f"joint {some[k][0]} by {apart[k]:.2g} {unit}" for k, unit in enumerate(units)]

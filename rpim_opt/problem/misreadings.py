@@ -429,6 +429,9 @@ def _other_robots(points: Points) -> Iterator[Misreading]:
         slipped[:, k] = np.roll(mdh[:, k], -by)
         what = f"column {column} one row too {low} in the DH table"
         tables.append((what, f"move column {column} one row {back} in the DH table", slipped))
+    for i in range(len(mdh) - 1):
+        rows = np.insert(np.delete(np.arange(len(mdh)), i), i + 1, i)
+        tables.append((f"rows {i + 1} and {i + 2} of the DH table exchanged", "exchange them", mdh[rows]))
     others = [(what, remedy, replace(robot, mdh=table)) for what, remedy, table in tables]
     ready = {name: read_robot(READY / f"{name}.toml") for name in robots()}
     others += [(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', of) for name, of in ready.items()]

@@ -190,6 +190,12 @@ def dh_table(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     return changed
 
 
+def pasted_twice(y: np.ndarray) -> np.ndarray:
+    """Write the values of eight rows again in the place of others."""
+    y[27:35] = y[7:15]
+    return y
+
+
 def deviations(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
     """Write how far the points are from those of the nominal robot."""
     computed = problem.modelled(np.zeros(len(problem.parameters.free)))[0]
@@ -313,6 +319,11 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
         dh_table(lambda mdh: mdh[:, [0, 3, 2, 1, 4]]),
         "columns a and d of the DH table exchanged",
     ),
+    "rows of the DH table exchanged": (
+        dh_table(lambda mdh: mdh[[0, 1, 2, 4, 3, *range(5, len(mdh))]]),
+        "rows 4 and 5 of the DH table exchanged",
+    ),
+    "a block pasted twice": (values(pasted_twice), "rows P28 (P8), P29 (P9), P30 (P10)"),
     "signs of x lost": (
         values(lambda y: np.column_stack([np.abs(y[:, 0] - y[:, 0].mean()), y[:, 1:]])),
         "values of coordinate x",

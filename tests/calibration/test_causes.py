@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.calibration import inspect, likely_causes
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.problem.diagnosis import left_out_together, other_rows, rows_without_values
+from rpim_opt.problem import misreadings
+from rpim_opt.problem.diagnosis import left_out_together, other_rows, rows_without_values, two_positions
 from rpim_opt.problem.misreadings import better_reading
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
@@ -76,6 +77,7 @@ QUICK = {
         "joint 3 coupled to 2",
         "values a row too low",
         "two rows exchanged",
+        "a block pasted twice",
         "a reading missed, a later one taken twice",
         "joints rounded to 0.1 degrees",
         "every third row computed",
@@ -672,6 +674,40 @@ def test_rows_of_reflectors_that_no_column_names_are_told_apart(rows: np.ndarray
     found = re.search(r"fit another reflector, ([\d.]+) mm away", causes[1])
     assert found
     assert float(found[1]) == pytest.approx(apart, abs=2)
+
+
+def test_rows_in_which_the_reflector_was_loose_are_named() -> None:
+    """A third of them: too many to be outliers, and taken for the robot's repeatability before, 0.4 mm."""
+    slipped, rng = np.arange(COUNT) % 3 == 1, np.random.default_rng(6)
+    slip = 1e-3 * rng.uniform(0.5, 2, COUNT) * slipped
+    wrong = values(lambda y: y + slip[:, None] * Rotation.random(COUNT, random_state=2).as_matrix()[..., 2])
+    result = ro.calibrate(wrong(simulated_arm("ur5e")))
+    named = re.search(r"Likely: rows (.*) scatter [\d.]+ times as much as the others", str(result.verdict))
+    assert named, result.verdict
+    assert result.learned
+    left_out = {row.label for row in result.learned.left_out}  # of which there were too many
+    assert left_out | set(re.findall(r"P\d+", named[1])) == {f"P{i + 1}" for i in np.flatnonzero(slipped)}
+
+
+def test_backlash_of_one_joint_is_that_of_no_second_one() -> None:
+    """Which explains half of what is left by chance: 60 rows have 60 directions."""
+    sides = 0.75e-3 * np.random.default_rng(5).choice([-1, 1], 60)
+    problem = of_joint(1, lambda q: q + sides)(simulated_arm("irb120", count=60))
+    (said,) = two_positions(problem, ro.calibrate(problem, ro.tikhonov, 1.0).x, 0.5)
+    assert said.startswith("backlash, joint 2 by 1.5 mrad: one of two positions")
+
+
+@pytest.mark.slow
+def test_a_size_of_the_points_is_no_cause_where_wrong_lengths_explain_them(monkeypatch) -> None:
+    """Of a longer variant's DH table: points a third larger would fit seven times better, and be wrong."""
+    monkeypatch.setattr(misreadings, "robots", dict)  # whose right one would be named
+    longer = np.zeros((6, 5))
+    longer[2, 1], longer[3, 3] = 0.09, 0.14
+    wrong = mistakes.dh_table(lambda mdh: mdh + longer)(simulated_arm("irb120"))
+    result = ro.calibrate(wrong, ro.tikhonov, 1e-4)
+    (text,) = result.verdict.reasons
+    assert "manufacturing errors stay below 30 mm. Check the order, signs and units of the joint columns" in text
+    assert result.errors().max() < 3e-4
 
 
 @pytest.mark.parametrize("row", [9, 20, 30])
