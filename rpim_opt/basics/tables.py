@@ -15,6 +15,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from html import unescape
 from importlib import import_module
 from pathlib import Path
 from string import ascii_letters
@@ -38,7 +39,8 @@ EXCEL_ROWS = 2**20
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": " "}
 """What may stand between cells, by name; a space stands for any number of them."""
 SAMPLE = 2**15  # characters from which the separator is found
-TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts", ".md")
+HTML = (".html", ".htm")
+TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts", ".md", *HTML)
 EXCEL = (".xlsx", ".xlsm")
 NUMBERS_OF_ROW = 3  # numbers in a row from which on a sheet is one of measurements
 NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
@@ -50,6 +52,8 @@ FORTRAN = re.compile(r"(?<=\d)[dD](?=[+-]\d)")
 """The sign of an exponent of double precision, 0.15D+01."""
 SEXAGESIMAL = re.compile(r"(\d+)°\s*(\d+)['\u2032]\s*(\d+(?:[.,]\d+)?)(?:\"|\u2033|'')")
 """Degrees, minutes and seconds."""
+HTML_CELL = re.compile(r"<t[hd]\b([^>]*)>([^<]*(?:<(?!/?t(?:[hdr]|able|body|foot)\b)[^<]*)*)", re.IGNORECASE)
+"""What an HTML page states of a cell, and what is in it."""
 FOREIGN = re.compile(rb"[\x80-\xff]{4,}")
 """So many letters beyond ASCII follow each other in no Western European word."""
 LIST_OPENS = re.compile(r"[a-zA-Z]*[\[({][\s\d.+\-\[({]")
@@ -214,6 +218,8 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
     if sheet:
         raise InputError("--sheet", f"'{sheet}' of a text file", "an Excel workbook")
     whole, notes = decoded(path, encoding)
+    if path.suffix.lower() in HTML:
+        whole = "\n".join("\t".join(_cells_of_html(row)) for row in re.split(r"(?i)<tr\b", whole)[1:])
     text = FORTRAN.sub("e", NO_NUMBER.sub("", SEXAGESIMAL.sub(_decimal, whole)))
     mark = SEPARATORS.get(separator, separator.replace("\\t", "\t")) if separator else _separator(text)
     if len(mark) != 1:
@@ -223,6 +229,14 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
         why = "as requested" if separator else "this separates most numbers"
         notes = (*notes, f"cells are separated by {spelled}: {why}.")
     return Grid(*_split(text, mark), notes, mark == " ")
+
+
+def _cells_of_html(row: str) -> Iterator[str]:
+    """Yield the cells of a row of an HTML table; one that spans several columns is followed by empty ones."""
+    for stated, inside in HTML_CELL.findall(row):
+        yield " ".join(unescape(re.sub(r"<[^>]*>", " ", inside)).split())
+        span = re.search(r"colspan\W+(\d{1,3})\b", stated, re.IGNORECASE)
+        yield from [""] * (int(span[1]) - 1 if span else 0)
 
 
 def _decimal(angle: re.Match[str]) -> str:

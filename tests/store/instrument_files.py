@@ -444,6 +444,12 @@ STRANGERS: dict[str, Shape] = {
         ("p.dtx", lines('<Value j1="{1}" j2="{2}" j3="{3}" j4="{4}" j5="{5}" j6="{6}"/>\n')),
         ("points.csv", text([["Point", *HEAD[7:]]], [[str(i), *row] for i, row in enumerate(POINTS)])),
     ),
+    "a page of HTML, a group header above": one(
+        "<html><body><h1>Report</h1><p>by: me<table border=1>\n<tr><th>Point<th colspan='6'>Joints [deg]<th colspan=\"3\">Measured [mm]\n<TR>"
+        + "".join(f"<th>{name}" for name in ["", *joint_names("J{}"), *"XYZ"])
+        + "".join("<tr>" + "".join(f"<td class='c'><b>{cell}</b>&nbsp;</td>" for cell in row) + "</tr>\n" for row in ROWS)
+        + "</table><p>end</body></html>", "raw.html",
+    ),
     "Yaskawa job": program("P.JBI", "///POSTYPE ANGLE\n" + lines("C{:05d}={},{},{},{},{},{}\n"), key="row"),
     "KUKA, inline axes": program("m.src", lines("PTP {{A1 {1},A2 {2},A3 {3},A4 {4},A5 {5},A6 {6}}}\n"), key="row"),
     "RAPID, MoveAbsJ alone": program("m.mod", lines("MoveAbsJ [[{1},{2},{3},{4},{5},{6}],[9E9,9E9]],v9;\n"), key="row"),

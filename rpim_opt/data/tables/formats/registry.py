@@ -18,7 +18,7 @@ Rows = Sequence[Mapping[str, Any]]
 """Cells by the names of their columns, with units as in headers: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
 
 NO_TABLES = (".xml", ".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl",
-             ".html", ".htm", ".py", ".ipynb")  # fmt: skip
+             ".py", ".ipynb")  # fmt: skip
 """Endings of files that are no tables as text; any other unknown ending may be one of an instrument's table."""
 
 
