@@ -262,8 +262,8 @@ def _model_lines(learned: Learned) -> list[str]:
 def _figure(size: Size, factor: float, unit: str) -> str:
     """Return a hyperparameter with its 95 % confidence interval as text."""
     spread = np.exp(TWO_SIDED * min(size.spread, 7.0))
-    value = factor * size.value
-    return f"{value:.2g} {unit} (95 % CI {value / spread:.2g} to {value * spread:.2g})"
+    value, low, high = (f"{float(f'{factor * size.value * by:.2g}'):,g}" for by in (1.0, 1 / spread, spread))
+    return f"{value} {unit} (95 % CI {low} to {high})"
 
 
 def _figure_or_bound(size: Size, factor: float, unit: str) -> str:

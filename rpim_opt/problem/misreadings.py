@@ -52,14 +52,8 @@ LENGTHS = {
 }
 """Factors between units of lengths, what was read wrongly, and what to write."""
 ANGLES = {
-    np.pi / 180: (
-        "as degrees, not radians",
-        "name the columns q1_deg, ... (--units deg), or convert an array to radians",
-    ),
-    180 / np.pi: (
-        "as radians, not degrees",
-        "name the columns q1_rad, ... (--units rad), or leave out np.radians of an array",
-    ),
+    np.pi / 180: ("as degrees, not radians", "name the columns q1_deg, ... (--units deg), or use np.radians(q)"),
+    180 / np.pi: ("as radians, not degrees", "name the columns q1_rad, ... (--units rad), or leave out np.radians"),
     0.9: ("as gon, not degrees", "multiply the joint values by 0.9"),
     360.0: ("as turns, not degrees", "multiply the joint values by 360"),
     1e-3: ("as thousandths of a degree", "divide the joint values by 1000"),

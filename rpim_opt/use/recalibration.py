@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from rpim_opt.basics.text import counted, joined, table, three_digits
 from rpim_opt.basics.units import display, printed
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
-from rpim_opt.calibration.held_out import displacement, registered
+from rpim_opt.calibration.held_out import displacement, registered, unregistered
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors, transmission_errors
@@ -290,8 +291,17 @@ def update(
         prior_inflation, released, left_out,
     )  # fmt: skip
     held_out = None if released else result.record.validation  # which was measured before a change
-    rows = {"new": updated.problem.data, "held-out": held_out}
-    errors = {name: {"before": result.errors(of), "after": updated.errors(of)} for name, of in rows.items() if of}
+    new = before = updated.problem.data
+    if apart := unregistered(result, new, held_out_errors(result, new)):
+        with suppress(InputError):  # few rows
+            before = registered(result, new)[0]
+            elsewhere += (
+                f"{apart.partition(':')[0]}: errors with the previous calibration are those after registration."
+            )
+    rows = {"new": (before, new), "held-out": (held_out, held_out)}
+    errors = {
+        name: {"before": result.errors(a), "after": updated.errors(b)} for name, (a, b) in rows.items() if a and b
+    }
     figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
     figures = {name: each for name, each in figures.items() if each["after"]["count"]}  # those with lengths
     updated = replace(updated, record=_carried_on(result.record, last, source))

@@ -148,6 +148,8 @@ def test_a_third_place_is_no_change_of_the_robot_and_says_nothing_of_it_before_i
     assert ro.use.monitor(result, data).mistake == found.no_intervals
     updated = ro.use.update(result, data)
     assert not updated.changed
+    assert updated.errors["new"]["before"]["rms_mm"] < 0.1
+    assert "session 'third' is unknown: errors with the previous" in str(updated)
     assert updated.explained
     notes = ro.use.session_notes(ro.use.in_session(updated.result))
     for text in ("'third' x", "'near' (by rows before the update) x", "'far' (by rows before the update) x"):
@@ -201,6 +203,8 @@ def test_new_registers_sessions_that_stand_apart_by_themselves(
     names = problem.parameters.free.names
     assert not {"session_far_x", "session_near_rz"} - set(names)
     assert not any(name.startswith("base_") for name in names)
-    view = ro.use.in_session(ro.calibrate(problem))
+    result = ro.calibrate(problem)
+    assert re.search(r"Session offsets \(1 sigma\): [12],\d00 mm \(95 % CI ", str(result))
+    view = ro.use.in_session(result)
     assert view.verdict.delivered
     assert 2 * np.median(np.linalg.norm(view.predict(arm.true.q, of="reached").standard, axis=1)) < 1.5e-4
