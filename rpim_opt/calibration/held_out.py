@@ -10,7 +10,6 @@ from scipy.special import fdtrc
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import listed
 from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage
@@ -28,13 +27,6 @@ GROSS = 6.0  # factor on the median distance from which on a row does not count 
 def rows_used(result: Calibration, data: Dataset) -> dict[str, str]:
     """Return the labels of measurements that are copies of identification rows, with the labels of those."""
     return dict(common_rows(result.problem.sample().data, data))
-
-
-def unregistered(result: Calibration, data: Dataset, held: HeldOut) -> str:
-    """Say of which sessions the registration is unknown and rows have no interval; empty without such."""
-    sessions = {*data.session[np.isnan(held.sigmas)]} - {*result.problem.sample().data.session}
-    named = listed(sorted(f"'{name}'" for name in sessions))
-    return named and f"Where the instrument stood in session {named} is unknown: no intervals. Use --register."
 
 
 def coverage_text(coverage: float, rows: int) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import bdtr, fdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.text import Tabled
+from rpim_opt.basics.text import Tabled, listed
 from rpim_opt.bayes.hyperparameters import sessions_spread
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.transmission import series
@@ -247,6 +247,13 @@ def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None =
         inside.append(within[predicted & counted[block.row]][:, lengths].ravel())
     covered = np.concatenate(inside)
     return replace(held, coverage=float(covered.mean()) if len(covered) else None)
+
+
+def unregistered(result: Outcome, data: Dataset, held: HeldOut) -> str:
+    """Say of which sessions the registration is unknown and rows have no interval; empty without such."""
+    sessions = {*data.session[np.isnan(held.sigmas)]} - {*result.problem.sample().data.session}
+    named = listed(sorted(f"'{name}'" for name in sessions))
+    return named and f"Where the instrument stood in session {named} is unknown: register its rows (--register)."
 
 
 def required_coverage(rows: int) -> float:

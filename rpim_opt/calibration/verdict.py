@@ -15,7 +15,7 @@ from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.basics.units import fits
 from rpim_opt.calibration.diagnosis import flagged
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage
+from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage, unregistered
 from rpim_opt.convex.constraints import name_of
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
@@ -296,7 +296,9 @@ def _worse(result: Outcome) -> Iterator[str]:
     if not said and rms(result.errors()) < rms(held.error):
         said = implausible(result, held)
     if said:
-        read = "" if validation is None or not result.problem.keeps_rows else misread(result, validation)
+        read = ""
+        if validation is not None and result.problem.keeps_rows:
+            read = unregistered(result, validation, held) or misread(result, validation)
         yield f"Held-out rows do not fit. {read}" if read else said
 
 

@@ -16,9 +16,8 @@ from rpim_opt.basics.tables import csv_text, records
 from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import noise_covariances
-from rpim_opt.calibration.held_out import unregistered
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import held_out_errors
+from rpim_opt.calibration.uncertainty import held_out_errors, unregistered
 from rpim_opt.calibration.verdict import misread
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem

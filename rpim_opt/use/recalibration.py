@@ -17,10 +17,10 @@ from rpim_opt.basics.text import counted, joined, table, three_digits
 from rpim_opt.basics.units import display, printed
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
-from rpim_opt.calibration.held_out import displacement, registered, unregistered
+from rpim_opt.calibration.held_out import displacement, registered
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import held_out_errors, transmission_errors
+from rpim_opt.calibration.uncertainty import held_out_errors, transmission_errors, unregistered
 from rpim_opt.calibration.verdict import refuse_misread
 from rpim_opt.convex.constraints import matching
 from rpim_opt.convex.expressions import SQUARES

@@ -12,9 +12,9 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import coverage_text, unregistered
+from rpim_opt.calibration.held_out import coverage_text
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import held_out_errors
+from rpim_opt.calibration.uncertainty import held_out_errors, unregistered
 from rpim_opt.calibration.verdict import implausible, misread, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset

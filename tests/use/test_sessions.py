@@ -146,6 +146,8 @@ def test_a_third_place_is_no_change_of_the_robot_and_says_nothing_of_it_before_i
     assert found.coverage is None
     assert "Where the instrument stood in session 'third' is unknown" in str(found)
     assert ro.use.monitor(result, data).mistake == found.no_intervals
+    judged = replace(result, record=replace(result.record, validation=data)).verdict
+    assert f"Held-out rows do not fit. {found.no_intervals}" in judged.reasons
     updated = ro.use.update(result, data)
     assert not updated.changed
     assert updated.errors["new"]["before"]["rms_mm"] < 0.1
