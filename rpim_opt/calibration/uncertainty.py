@@ -18,6 +18,7 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import CONFIDENCE, HeldOut
+from rpim_opt.robot.parameters import of_session
 from rpim_opt.robot.terms import transmission
 
 APART = 1e4  # variance of an unknown session over a reading's, from which on an interval says nothing
@@ -251,6 +252,8 @@ def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None =
 
 def unregistered(result: Outcome, data: Dataset, held: HeldOut) -> str:
     """Say of which sessions the registration is unknown and rows have no interval; empty without such."""
+    if result.no_intervals or not any(map(of_session, result.problem.parameters.free.names)):
+        return ""
     sessions = {*data.session[np.isnan(held.sigmas)]} - {*result.problem.sample().data.session}
     named = listed(sorted(f"'{name}'" for name in sessions))
     return named and f"Where the instrument stood in session {named} is unknown: register its rows (--register)."

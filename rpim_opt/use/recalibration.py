@@ -295,13 +295,9 @@ def update(
     if apart := unregistered(result, new, held_out_errors(result, new)):
         with suppress(InputError):  # few rows
             before = registered(result, new)[0]
-            elsewhere += (
-                f"{apart.partition(':')[0]}: errors with the previous calibration are those after registration."
-            )
+            elsewhere += f"{apart.partition(':')[0]}: errors with the previous calibration are after registration."
     rows = {"new": (before, new), "held-out": (held_out, held_out)}
-    errors = {
-        name: {"before": result.errors(a), "after": updated.errors(b)} for name, (a, b) in rows.items() if a and b
-    }
+    errors = {key: {"before": result.errors(a), "after": updated.errors(b)} for key, (a, b) in rows.items() if a and b}
     figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
     figures = {name: each for name, each in figures.items() if each["after"]["count"]}  # those with lengths
     updated = replace(updated, record=_carried_on(result.record, last, source))
@@ -480,9 +476,7 @@ def prior_widths(result: Calibration, problem: Source) -> Array:
     free = problem.parameters.free
     learned = result.learned
     stated = {} if learned is None else dict(zip(result.problem.parameters.free.names, learned.stated, strict=True))
-    stated = {
-        name.rpartition("_")[2]: own for name, own in stated.items() if of_session(name)
-    } | stated  # new ones, too
+    stated |= {name.rpartition("_")[2]: own for name, own in stated.items() if of_session(name)}  # of new ones, too
     keys = [name.rpartition("_")[2] if of_session(name) and name not in stated else name for name in free.names]
     scale = [stated.get(key, own) for key, own in zip(keys, free.scale, strict=True)]
     return default_widths(replace(free, scale=np.array(scale)))
