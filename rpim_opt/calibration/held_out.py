@@ -19,6 +19,7 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import HeldOut
 from rpim_opt.problem.diagnosis import common_rows
 from rpim_opt.problem.registration.closed_forms import register, transformed
+from rpim_opt.robot.parameters import Parameters, of_session, session_prefix
 
 FEWEST = 5  # held-out rows below which they are too few to judge
 GROSS = 6.0  # factor on the median distance from which on a row does not count for a registration
@@ -33,6 +34,12 @@ def coverage_text(coverage: float, rows: int) -> str:
     """Return the coverage of 95 % prediction intervals, beside the `required_coverage`, as text."""
     share = f"{100 * coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
     return f"{share} (at least {100 * required_coverage(rows):.0f} % are required for this number of rows)"
+
+
+def registration(free: Parameters, data: Dataset) -> str:
+    """Return the prefix of the frame that says where rows were measured: the base, or without it that of a session."""
+    based = any(name.startswith("base_") for name in free.names)
+    return "base_" if based or not any(map(of_session, free.names)) else session_prefix(str(data.session[0]))
 
 
 def displacement(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
@@ -59,10 +66,11 @@ def displacement(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str
         f"The measurements are {motion}; registered again, their RMS error is {1e3 * after:.3g} mm instead of "
         f"{1e3 * before:.3g} mm."
     )
+    place = registration(result.problem.parameters.free, data)
     if far and after <= before / 2:
         return (
             f"Likely: the instrument or the base moved. {said} Use --register in `validate`, `monitor` and `accept`, "
-            "or recalibrate by `update --reset 'base_*'`; do not add such rows to the problem's folder. If neither "
+            f"or recalibrate by `update --reset '{place}*'`; do not add such rows to the problem's folder. If neither "
             "moved, the robot has a common error at these configurations."
         ), ""
     if fdtrc(6, freedom, (squares - left) / 6 / (left / freedom)) < UNLIKELY:

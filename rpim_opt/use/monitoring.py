@@ -284,7 +284,7 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
     A = framed.linearize(recalibration.previous_deviations(result, framed)).A / np.sqrt(result.variance_factor)
     width = recalibration.prior_widths(result, framed) / free.scale
     tried: list[tuple[float, Drift]] = []
-    causes = recalibration.candidates(free)
+    causes = recalibration.candidates(free, problem.data)
     for cause, prior in zip(causes, recalibration.log_priors(causes), strict=True):
         index = [free.names.index(name) for name in cause.members]
         scale = float(free.scale[index[0]])

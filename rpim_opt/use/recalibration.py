@@ -17,7 +17,7 @@ from rpim_opt.basics.text import counted, joined, table, three_digits
 from rpim_opt.basics.units import display, printed
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
-from rpim_opt.calibration.held_out import displacement, registered
+from rpim_opt.calibration.held_out import displacement, registered, registration
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors, transmission_errors, unregistered
@@ -33,9 +33,10 @@ from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.multi_robot import identifying_sessions
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import placed, same_place
-from rpim_opt.robot.kinematics import FRAME
+from rpim_opt.robot.kinematics import FRAME, frame_numbers
 from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session
 from rpim_opt.store.result_file import content
+from rpim_opt.use.sessions import base_frame
 
 FALSE_ALARM = 0.01  # probability that a robot that did not change, or does not drift, is said to, over all causes
 MULTIPLES = (1.0, 3.0, 10.0, 30.0)  # multiples of a deviation's prior width that a change may have, each as likely
@@ -254,7 +255,7 @@ def update(
     say("comparing with the previous calibration")
     elsewhere = "" if released else _base_elsewhere(result, problem, prior_inflation)
     if elsewhere:
-        released = tuple(name for name in free.names if name.startswith(BASE))
+        released = tuple(name for name in free.names if name.startswith(registration(free, data)))
     # a frame that was reset may be anywhere: then it is registered again
     start = None if released else previous_deviations(result, problem)
     changes: list[Cause] = []
@@ -341,17 +342,19 @@ def _robots(result: Calibration) -> str:
 def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation: float) -> str:
     """Say where the base is and was, if readings that are displaced together put it out of its place; empty else."""
     # evidence is linear in the deviations: of a base that turned far, it is none
-    base = [name for name in problem.parameters.free.names if name.startswith(BASE)]
+    free, data = problem.parameters.free, problem.data
+    place = registration(free, data)
+    base = [name for name in free.names if name.startswith(place)]
     if not base or not displacement(result, problem.data, held_out_errors(result, problem.data))[0]:
         return ""
     registered = _recalibrated(result, problem, base, inflation, None)
-    tables = ((each.problem.parameters, each.x) for each in (result, registered))
-    was, now = (p.values_at(x)[p.frame(BASE)] for p, x in tables)
+    session = "" if place == BASE else str(data.session[0])
+    was, now = (np.array(frame_numbers(base_frame(each, "", session))) for each in (result, registered))
     if same_place(was, now):
         return ""
     return (
         f"The instrument or the base moved: in the instrument's frame the base is at {placed(now)}, previously at "
-        f"{placed(was)}. It was registered again, as with --reset 'base_*'."
+        f"{placed(was)}. It was registered again, as with --reset '{place}*'."
     )
 
 
@@ -361,13 +364,14 @@ def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple
     That is less by `AS_GOOD`, of new measurements and prior together, than after registration and with another base.
     """
     moved = displacement(result, data, held)
-    placed_by = {BASE + axis for axis in FRAME} <= set(result.problem.parameters.free.names)
+    place = registration(result.problem.parameters.free, data)
+    placed_by = {place + axis for axis in FRAME} <= set(result.problem.parameters.free.names)
     if not any(moved) or not placed_by or result.known_covariance is None or not result.problem.keeps_rows:
         return moved
     causes, fit = _changes(result, data)
     again, registered_fit = _changes(result, registered(result, data)[0])
     best, *others = [cause for cause in causes if cause.kind != "reading"]
-    base = next(cause for cause in again if cause.members[0].startswith(BASE))
+    base = next(cause for cause in again if cause.members[0].startswith(place))
     left, motion = fit.squares - best.gain, registered_fit.squares - base.gain
     if motion - left <= AS_GOOD:
         return moved
@@ -552,12 +556,13 @@ class Misfit:
         return float(fdtrc(m, self.freedom, squares / m))
 
 
-def candidates(free: Parameters, reset: Sequence[str] = ()) -> list[Cause]:
+def candidates(free: Parameters, data: Dataset, reset: Sequence[str] = ()) -> list[Cause]:
     """Return the candidate changes: parameters of the robot, frames and transmission errors as a whole; none reset."""
+    place = registration(free, data)
     causes = []
     wholes: dict[tuple[str, str], list[str]] = {}
     for name, frame, curve in zip(free.names, free.of_frames, free.of_curves, strict=True):
-        if name in reset or of_session(name):  # an earlier session is over
+        if name in reset or (of_session(name) and not name.startswith(place)):  # an earlier session is over
             continue
         if frame or curve:
             kind = "frame" if frame else "transmission error"
@@ -576,7 +581,7 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
     width = prior_widths(result, updated.problem) / free.scale
     causes: list[Cause] = []
     logs: list[float] = []
-    for cause in candidates(free, released):
+    for cause in candidates(free, updated.problem.data, released):
         index = [free.names.index(name) for name in cause.members]
         change = misfit.projected(slice(misfit.m, None), misfit.L[:, index])
         causes.append(misfit.evidence(cause, *change))
