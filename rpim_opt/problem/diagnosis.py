@@ -698,13 +698,16 @@ def _explained(
     without = _without_parameters(model)
     rest = without((model.b - model.A @ (x / model.parameters.scale))[:, None])[:, 0]
     whole = float(rest @ rest)
+    every = list(additions)
     tried: list[tuple[float, float, Addition, Array]] = []  # by the variance that is left: of many columns against few
-    for addition in additions:
+    for addition in every:
         G = without(addition.columns)
         step = np.asarray(np.linalg.lstsq(G, rest, rcond=1e-9)[0], dtype=float)
         gain = whole - float(np.sum((rest - G @ step) ** 2))
         spare = max(len(model.A) - taken - len(step), 1)
-        tried.append(((whole - gain) / spare, gain, addition, step))
+        # one of many mistakes is ahead of what is none by chance, unless it is that many times as likely
+        odds = 1.0 if addition.said is None else len(every) ** (2 / spare)
+        tried.append(((whole - gain) / spare * odds, gain, addition, step))
     if not tried or not whole:
         return None
     _, gain, addition, step = min(tried, key=lambda each: each[0])
@@ -829,9 +832,10 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
     cause = "is it loose in its nest, or its holder soft"
     yield from _changes(whole, there, A, [tool_prefix(m) + c for m in markers for c in "xyz"], "reflector", cause, down)
     free = whole.parameters.free
-    lacking = np.isin(free.names, every[(bends | eccentric) & ~p.identified])
-    if lacking.any():
-        yield Addition(A[:, lacking], None)
+    for family in (bends, eccentric, bends | eccentric):  # either alone explains more with fewer columns
+        lacking = np.isin(free.names, every[family & ~p.identified])
+        if lacking.any():
+            yield Addition(A[:, lacking], None)
     nominal = whole.parameters.nominal[whole.parameters.identified]
     of_arm = (np.array(free.dimensions) == "length") & ~free.of_frames
     elapsed = problem.owners / max(len(problem.data) - 1, 1)
@@ -966,7 +970,7 @@ def _uneven_noise(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         size = np.maximum(size * np.sqrt(np.bincount(which, (b - own @ (own.T @ b)) ** 2) / freedom), EXACT)
     *_, second, worst = np.argsort(size)
     times = float(size[worst] / size[second])
-    if times > NOISY and len(size) * fdtrc(freedom[worst], freedom[second], times**2) < RARE:
+    if times > NOISY and freedom.min() > 1 and len(size) * fdtrc(freedom[worst], freedom[second], times**2) < RARE:
         name = columns.pop()[worst]
         yield (
             f"values of column {name} scatter {three_digits(times)} times as much as those of the others, which they "

@@ -821,6 +821,27 @@ def test_gravity_that_is_not_modelled_is_no_coupling(robot: str, seed: int) -> N
     assert {"gravity", "first harmonic"} & set(lack_of_fit(result).missing)
 
 
+def test_gravity_of_few_rows_is_no_slipped_joint() -> None:
+    """A joint zero that changed at one of many places explains fourteen rows as well as compliances, by chance."""
+    problem = simulated_arm("tx60", 155, 14)
+    p = problem.parameters
+    whole = problem.identifying(p.identified | np.char.startswith(p.names, "compliance"))
+    free = whole.parameters.free
+    rng = np.random.default_rng([155, 1])
+    truth = np.where(np.char.startswith(free.names, "compliance"), 1.0, rng.normal(size=len(free))) * free.scale
+    y = whole.modelled(truth)[0]
+    result = ro.calibrate(values(lambda _: y + mistakes.NOISE * rng.normal(size=y.shape))(problem), model="auto")
+    assert result.verdict.delivered
+
+
+def test_columns_that_few_rows_fit_exactly_do_not_tell_the_noise_of_another() -> None:
+    """Three gross errors in ten rows: with x hardly weighed nothing is left of y and z."""
+    gross = np.zeros((10, 3))
+    gross[:3] = 0.01 * np.random.default_rng(3).normal(size=(3, 3))
+    result = ro.calibrate(values(lambda y: y + gross)(simulated_arm("ur5", 3, 10)))
+    assert "scatter" not in str(result.verdict)
+
+
 def test_misread_orientations_are_named() -> None:
     """Positions alone may fit well."""
     problem = ro.load("pose").problem

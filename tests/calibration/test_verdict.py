@@ -136,6 +136,14 @@ def test_few_rows_tell_a_worse_robot_from_chance(rows: int) -> None:
     assert sum(worse_than_nominal(a, b) for a, b in zip(nominal, far, strict=True)) >= 350
 
 
+def test_a_robot_twice_as_wrong_as_the_nominal_one_is_worse_whatever_few_errors_are() -> None:
+    """Errors of ten lengths' calibration, half of them within 0.7 mm and two of 6 and 7 mm, against 0.9 mm RMS."""
+    error = np.array([*np.linspace(0.02, 0.7, 17), *np.linspace(1.1, 2.5, 12), 3.8, 5.9, 7.0])
+    nominal = np.array([*np.linspace(0.01, 0.4, 18), *np.linspace(0.4, 2.0, 12), 2.1, 2.6])[::-1]
+    assert worse_than_nominal(nominal, error)
+    assert not worse_than_nominal(error, 0.9 * error)
+
+
 def test_files_hold_the_verdict(tmp_path: Path) -> None:
     result = ro.calibrate(simulated_arm("ur5e"), "tikhonov", 1.0, max_iterations=1)
     result = replace(result, known={"causes": ("Likely: joints 2 and 3 exchanged.",)})
