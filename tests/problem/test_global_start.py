@@ -165,6 +165,19 @@ def test_lengths_show_signs_and_zeros_but_not_which_of_two_mirror_images(name: s
     assert error(result, lengths(unseen)) < 1.2 * error(stated, lengths(unseen))
 
 
+def test_a_mirror_image_with_stated_signs_is_not_delivered_either() -> None:
+    """A reversed stroke and zeros of any size: lengths fit an arm with stated signs and other zeros as well."""
+    problem, _, _ = simulated("scara", 3, np.array([1.0, 1, -1, 1]), np.array([0.3, 1.0, 0, 0.8]))
+    away = np.linalg.norm(problem.data.blocks[0].y - [0.4, 0.9, 1.1], axis=1, keepdims=True)
+    result = ro.calibrate(
+        ro.problem_from(problem.robot, ro.Dataset.of(problem.data.q, away, NOISE, measurement="cable"))
+    )
+    assert result.mapping is not None
+    assert (result.mapping.sign > 0).all()
+    assert not result.verdict.delivered
+    assert "do not distinguish an arm from its mirror image" in str(result.verdict)
+
+
 def test_what_is_found_goes_into_the_mapping() -> None:
     """One joint reversed and one a quarter turn off are said exactly, in the words of robot.toml."""
     sign = np.array([1.0, 1, -1, 1, 1, 1])

@@ -128,8 +128,9 @@ class JointMapping:
 
     @property
     def ambiguities(self) -> tuple[str, ...]:
-        """Return sentences on alternatives of equal fit; no mirror image of an arm whose signs are as stated."""
-        as_nominal = bool((self.sign > 0).all())
+        """Return sentences on alternatives of equal fit; no mirror image of one with stated signs and quarter turns."""
+        turning = np.array(self.joint_types) == "revolute"
+        as_nominal = bool((self.sign > 0).all() and (self.zero[turning] % QUARTER == 0).all())
         return self._said([other for other in self.alternatives if not (other.mirror and as_nominal)])
 
     def _said(self, alternatives: Sequence[Alternative]) -> tuple[str, ...]:
