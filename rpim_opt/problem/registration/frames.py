@@ -215,7 +215,7 @@ def problem_from(
     (34, array([ 1.8 , -0.7 ,  0.35]))
     """
     if isinstance(robot, str | Path):
-        robot = read_arm(Path(robot) if Path(robot).is_file() else find_robot(str(robot)))
+        robot = read_arm(find_robot(str(robot)))
     if isinstance(robot, RobotSetup):
         tool = robot.tool if tool is None else tool
         robot = robot.robot
