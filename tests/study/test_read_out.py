@@ -69,8 +69,8 @@ def test_the_page_says_of_many_problems_how_many_and_which_have_no_figure(tmp_pa
     page = found.report(tmp_path / "out").read_text(encoding="utf-8")
     assert "3 methods on 6 problems" in page
     assert "p4, p5" in page
-    assert "| b | 50.0 |" in page
-    assert "| c | 0.500 | 0.500 | 0.500 | 0.500 | - | - |" in page
+    assert "| b | 50 |" in page
+    assert "| c | 0.5 | 0.5 | 0.5 | 0.5 | - | - |" in page
     all_of_them = compared({"a": even(1.0), "b": even(0.5) | dict.fromkeys(SIX)}).report(tmp_path / "all")
     assert "6 of 6 replicates" in all_of_them.read_text(encoding="utf-8")
 
