@@ -17,6 +17,7 @@ from rpim_opt.calibration.diagnosis import flagged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage, unregistered
 from rpim_opt.convex.constraints import name_of
+from rpim_opt.convex.program import pose
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
 from rpim_opt.problem import diagnosis
@@ -147,6 +148,11 @@ def residual_rms(result: Outcome, kept: np.ndarray) -> dict[str, tuple[float, fl
     return {each: (rms(error), noise_ratio(result.problem, error, each)) for each, error in errors.items()}
 
 
+def _worst_ratio(problem: CalibrationProblem, x: Array) -> float:
+    """Return the largest `noise_ratio` of a problem's errors at x (n,)."""
+    return max(noise_ratio(problem, problem.errors(x, each), each) for each in UNITS)
+
+
 def noise_ratio(problem: Source, errors: Array, dimension: str = "length") -> float:
     """Return the RMS of errors (N,) [SI] over that of the stated noise; 0 if the dimension was not measured."""
     variance = stated_variance(problem, dimension)
@@ -204,9 +210,8 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     checked = _overdetermined(result)
     for each, (size_of, ratio_of) in residuals.items():
         nominal = noise_ratio(result.problem, result.nominal_errors(dimension=each), each)  # with frames fitted
-        if (
-            checked and size_of > COMPUTED_RMS and 0 < min(ratio_of / OVERSTATED, NOISY * nominal) < 1
-        ):  # 0: it was not measured
+        small = 0 < min(ratio_of / OVERSTATED, NOISY * nominal) < 1  # 0: it was not measured
+        if checked and size_of > COMPUTED_RMS and small:
             yield f"Residuals are {ratio_of:.2g} times the stated noise, which is in another unit or far too large."
     if ratio > NOISY and share > REACH:
         yield (
@@ -499,13 +504,14 @@ def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: 
     """Say that loss, penalty or constraints leave what a squared penalty at weight 1 explains."""
     if kept.mean() < 1 - EXCLUDED:  # downweighted by a fit that is wrong everywhere
         kept = np.ones_like(kept)
-    rows = problem.on(problem.data.take(np.flatnonzero(kept)))
-    if not result.squared_loss:  # which would be biased by outliers, not by the formulation
-        rows = rows.without({flag.label for flag in flagged(rows, ridge_deviations(rows))})
-    now, plain = (
-        max(noise_ratio(rows, rows.errors(x, each), each) for each in UNITS) for x in (result.x, ridge_deviations(rows))
-    )
-    if plain > NOISY or now < NOTICED * plain:
+    rows, x = problem.on(problem.data.take(np.flatnonzero(kept))), result.x
+    outliers = set() if result.squared_loss else {flag.label for flag in flagged(rows, ridge_deviations(rows))}
+    if outliers:  # they bias the squares with which the fit is compared, and losses that are not robust
+        rows = rows.without(outliers)
+        again = pose(result.formulation, rows.linearize(x)).solve(result.weight)
+        x = rows.parameters.free.scale * again.z
+    before, now, plain = (_worst_ratio(rows, each) for each in (result.x, x, ridge_deviations(rows)))
+    if plain > NOISY or now < max(NOTICED * plain, before / NOISY):  # or outliers limited it
         return []
     names = [name_of(constraint, k) for k, constraint in enumerate(result.formulation.constraints)]
     remedy = f"Loosen its constraints ({joined(names)}) or use" if names else "Use"
@@ -588,11 +594,10 @@ def _without_outliers(
 
 
 def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Iterator[str]:
-    """Say that outliers make a squared loss fit badly, if all is well without them, else what other residuals show."""
+    """Say that outliers make a loss fit badly, if all is well without them, else what other residuals show."""
     alone, x = _without_outliers(result, ordered)
     single = [flag.label for flag in result.single]
-    ratio = max(noise_ratio(alone, alone.errors(x, each), each) for each in UNITS)
-    before = max(noise_ratio(ordered, ordered.errors(result.x, each), each) for each in UNITS)
+    ratio, before = _worst_ratio(alone, x), _worst_ratio(ordered, result.x)
     if single and result.squared_loss and ratio <= min(NOISY, diagnosis.MOVED**0.5 * before):
         yield (
             f"outliers ({listed(single)}): without them residuals are {three_digits(ratio)} times the measurement "

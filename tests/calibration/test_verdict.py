@@ -265,6 +265,13 @@ def test_a_formulation_that_forbids_what_is_true_limits_the_fit() -> None:
     assert "joints 2 and 3 exchanged" in str(wrong.verdict)
 
 
+def test_outliers_that_bias_a_loss_of_ones_own_are_named_and_not_the_formulation() -> None:
+    steep = ro.Formulation("steep", lambda v: cp.sum(v**4), cp.sum_squares)
+    for formulation in ("minimax", steep):
+        (reason,) = ro.calibrate(ro.load("blunders").problem, formulation, 1.0).verdict.reasons
+        assert "rows c1, c7, c14, c39 and c43 scatter" in reason
+
+
 def test_without_a_covariance_it_says_why_wherever_intervals_would_be() -> None:
     instance = ro.load("position")
     result = ro.calibrate(instance.problem, "lasso")
