@@ -46,7 +46,7 @@ from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.noise import in_unit
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.frames import fitted_frames
+from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
 from rpim_opt.problem.registration.global_start import JointMapping
 from rpim_opt.problem.row_functions import transform
 from rpim_opt.robot.mdh import MDH, Robot
@@ -308,7 +308,7 @@ class Outcome:
         """Return the error of every row for the nominal robot, (N,) [m]; arguments as for `errors`.
 
         Frames (base, reflectors, anchors, ...) that the calibration identifies are fitted to the identification data
-        first: before that they do not describe the robot.
+        first, of an update to the earlier ones, too: before that they do not describe the robot.
         """
         source, x = self._at(data, nominal=True)
         return source.errors(x, dimension)
@@ -320,8 +320,18 @@ class Outcome:
 
     @cached_property
     def _nominal(self) -> tuple[Source, Array]:
-        """The problem that identifies frames alone, and its solution under the prior that the scales state."""
-        return fitted_frames(self.stated)
+        """The problem that identifies frames alone, and its solution under the prior that the scales state.
+
+        Of a recalibration under its own prior, which is the earlier rows: the new ones may determine few frames.
+        """
+        form = self.program.penalty_form
+        if not self.record.earlier or form is None:
+            return fitted_frames(self.stated)
+        p = self.stated.parameters
+        alone = self.stated.identifying(p.of_frames & p.identified)
+        free, of = self.problem.parameters.free, alone.parameters.free
+        k = [free.names.index(name) for name in of.names]
+        return alone, ridge_deviations(alone, prior=(form.matrix[:, k] / free.scale[k] * of.scale, form.c))
 
     @cached_property
     def stated(self) -> Source:

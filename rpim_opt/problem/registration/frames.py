@@ -429,13 +429,16 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
     return alone, ridge_deviations(alone)
 
 
-def ridge_deviations(alone: Source, steps: int = 200) -> Array:
+def ridge_deviations(alone: Source, steps: int = 200, prior: tuple[Array, Array] | None = None) -> Array:
     """Return the deviations (n,) [SI] that minimize |A z - b|^2 + |z|^2, from nominal: a squared penalty at weight 1.
 
+    Of a ``prior`` L (k, n) and c (k,) it is |A z - b|^2 + |L z - c|^2, from the prior's minimum.
     Levenberg-Marquardt on the QR factor of a linearization, whatever the data's number.
     """
     source = in_parts(alone.frozen())
     scale = alone.parameters.free.scale
+    L, c = prior or (np.eye(len(scale)), np.zeros(len(scale)))
+    start = np.linalg.lstsq(L, c, rcond=None)[0] if prior else c
     at: list[Array] = []  # where it was linearized last, and the factor: slopes are evaluated where residuals were
 
     def triangle(z: Array) -> Array:
@@ -444,12 +447,12 @@ def ridge_deviations(alone: Source, steps: int = 200) -> Array:
         return at[1]
 
     def residual(z: Array) -> Array:
-        return np.concatenate([triangle(z) @ [*z, -1.0], z])
+        return np.concatenate([triangle(z) @ [*z, -1.0], L @ z - c])
 
     def slopes(z: Array) -> Array:
-        return np.vstack([triangle(z)[:, :-1], np.eye(len(z))])
+        return np.vstack([triangle(z)[:, :-1], L])
 
     options: Any = {"jac": slopes, "x_scale": "jac", "xtol": 1e-11, "ftol": 1e-15, "gtol": 1e-15}
-    z = least_squares(residual, np.zeros(len(scale)), method="lm", max_nfev=steps, **options).x
+    z = least_squares(residual, start, method="lm", max_nfev=steps, **options).x
     z = z - np.linalg.lstsq(slopes(z), residual(z), rcond=None)[0]  # where a sum of squares no longer changes
     return np.asarray(scale * z, dtype=float)
