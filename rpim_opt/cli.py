@@ -535,8 +535,8 @@ def monitor(
     Exit code 1 if the robot drifts.
     """
     with _loaded(result) as (loaded, _):
-        read = ro.use.read_measurements(loaded, checks, measurement, tables.options, register)
-        monitoring = ro.use.monitor(loaded, read.data, read.when, read.clock[1] if read.clock else ())
+        read = ro.use.read_measurements(loaded, checks, measurement, tables.options)
+        monitoring = ro.use.monitor(loaded, read.data, read.when, read.clock[1] if read.clock else (), register)
         if out is not None:
             ro.report.write_checks(monitoring, out, loaded.record.title)
     written = [] if out is None else [out]

@@ -10,6 +10,7 @@ from scipy.special import fdtrc
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage
@@ -78,19 +79,19 @@ def displacement(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str
     return "", ""
 
 
-def registered(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
+def registered(result: Calibration, data: Dataset, mine: np.ndarray | None = None) -> tuple[Dataset, str]:
     """Return measurements after the motion of the instrument that registers them best, and that motion in words.
 
-    Positions, poses and their covariances turn, lengths stay. The motion takes six degrees of freedom; rows beyond
-    six times the median distance do not count for it. InputError for rows of the identification data, which are in the
-    calibration's frame and would not be recognized after a motion; for fewer than five positions; points on a line.
+    Positions, poses and their covariances turn, lengths stay, and so do rows that are not ``mine`` (N,). The motion
+    takes six degrees of freedom; rows beyond six times the median distance do not count for it. InputError for rows of
+    the identification data, which are in the calibration's frame and would not be recognized after a motion; for fewer
+    than three positions; points on a line.
     """
+    mine = np.full(len(data), True) if mine is None else mine
     if used := rows_used(result, data):
-        raise InputError("--register", f"{len(used)} of {len(data)} rows are identification rows", "new rows only")
+        raise InputError("measurements", f"{len(used)} of {len(data)} rows are identification rows", "new rows only")
     vectors = result.error_vectors(data)
-    rows = np.flatnonzero(np.isfinite(vectors).all(axis=1))
-    if len(rows) < FEWEST:
-        raise InputError("--register", f"{len(rows)} measured positions", f"at least {FEWEST}")
+    rows = np.flatnonzero(np.isfinite(vectors).all(axis=1) & mine)
     measured = result.measured_positions(data)[rows]
     predicted = measured - vectors[rows]
     first = register(measured, predicted)
@@ -104,12 +105,13 @@ def registered(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
             places = block.y[:, :3]
             moves = np.hstack([transformed(motion, places) - places, np.tile(turn.as_rotvec(), (len(places), 1))])
             parts = np.kron(np.eye(block.covariance.shape[-1] // 3), motion[:3, :3])
-            moved = block.measurement.plus(block.y, moves[:, : len(block.measurement.components)])
-            block = replace(block, y=moved, covariance=parts @ block.covariance @ parts.T)
+            moves = moves[:, : len(block.measurement.components)] * mine[block.row, None]
+            covariance = np.where(mine[block.row, None, None], parts @ block.covariance @ parts.T, block.covariance)
+            block = replace(block, y=block.measurement.plus(block.y, moves), covariance=covariance)
         blocks.append(block)
     centre = measured.mean(axis=0)
-    shift = 1e3 * np.linalg.norm(transformed(motion, centre) - centre)
-    text = f"displaced as a whole by {shift:.3g} mm and {np.degrees(turn.magnitude()):.3g} degrees"
+    shift = 1e3 * float(np.linalg.norm(transformed(motion, centre) - centre))
+    text = f"displaced as a whole by {three_digits(shift)} mm and {np.degrees(turn.magnitude()):.3g} degrees"
     return replace(data, blocks=tuple(blocks)), text
 
 

@@ -17,11 +17,13 @@ from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import noise_covariances
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import held_out_errors, unregistered
+from rpim_opt.calibration.uncertainty import APART, held_out_errors, unregistered
 from rpim_opt.calibration.verdict import misread
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.parameters import own_name
 from rpim_opt.use import recalibration
+from rpim_opt.use.sessions import registered_again, set_ups
 
 TESTS = 3  # each check alone, their sum, and every parameter: each may err by a third of `recalibration.FALSE_ALARM`
 MOMENTS = 40  # checks before which a change is looked for; of more so many, evenly
@@ -29,6 +31,7 @@ SMALLEST = 1e-12  # probabilities are taken as no smaller: 7 standard deviations
 ALLOWANCE = 0.5  # CUSUM's reference value k, taken off every deviate: sums answer fastest to a shift of twice as much
 CELLS = 150  # steps of a sum's range in the Markov chain of its distribution
 HIGHEST_LIMIT = 50.0
+MOTION = 1.0  # standard deviation of a motion that the checks alone tell [m, rad]
 
 
 class Drift(NamedTuple):
@@ -54,7 +57,8 @@ class Monitoring:
     are the errors against the calibration [m]; ``sigmas`` (N,) the innovation of a check, beyond the calibration and
     the checks before it, in standard deviations of a new reading, and ``allowed`` (N,) the limit that one of all N
     rarely exceeds; ``sums`` (N,) their cumulative sum (CUSUM) and ``limit`` what it rarely exceeds. ``drift`` is the
-    change that explains them best, None where chance does; ``mistake`` a likely one in the checks, in a sentence.
+    change that explains them best, None where chance does; ``mistake`` a likely one in the checks, in a sentence;
+    ``registered`` states the motions of checks that were registered again.
     """
 
     label: tuple[str, ...]
@@ -67,6 +71,7 @@ class Monitoring:
     limit: float
     drift: Drift | None = None
     mistake: str = ""
+    registered: str = ""
 
     @property
     def beyond(self) -> tuple[int, ...]:
@@ -95,6 +100,7 @@ class Monitoring:
             "limit": self.limit,
             "moved": None if drift is None else {**drift.content(), "label": self.label[drift.first]},
             "mistake": self.mistake,
+            "registered": self.registered,
             "rows": records(self._columns()),
         }
 
@@ -132,7 +138,7 @@ class Monitoring:
             f"({self.allowed[worst]:.1f} allowed), {1e3 * self.error[worst]:.3f} mm. "
             f"Largest cumulative sum: {self.sums.max():.1f} ({self.limit:.1f} allowed)."
         )
-        return "\n".join(lines)
+        return "\n".join([*lines, *filter(None, [self.registered])])
 
     def _since(self, alarm: int) -> int:
         """Return the first check that led to an alarm: after the last sum that was zero."""
@@ -149,7 +155,9 @@ class Monitoring:
         return columns | {name: [round(value, 6) for value in values.tolist()] for name, values in figures.items()}
 
 
-def monitor(result: Calibration, data: Dataset, when: Array | None = None, times: tuple[str, ...] = ()) -> Monitoring:
+def monitor(
+    result: Calibration, data: Dataset, when: Array | None = None, times: tuple[str, ...] = (), register: bool = False
+) -> Monitoring:
     """Compare checks over time with the predictions of a calibration, singly and by their cumulative sum.
 
     A check is judged by the prediction interval of a new reading, given the calibration and all checks before it; the
@@ -157,7 +165,8 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     some check or steadily. A robot that does not drift raises a false alarm with probability 0.01 in all.
 
     The result has a squared penalty or none. ``data`` are check readings in the instrument's frame of the calibration,
-    in the order of ``when`` (N,) [s] if that is stated; ``times`` are their N texts.
+    in the order of ``when`` (N,) [s] if that is stated; ``times`` are their N texts. If they ``register``, each of
+    their `set_ups` may be in a frame of its own: its motion is unknown in all tests, and takes six equations of them.
     InputError for times that are not one a check, and a result that has no covariance (lasso).
 
     >>> import rpim_opt as ro
@@ -181,26 +190,34 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     visit = np.cumsum(np.diff(data.configuration, prepend=data.configuration[0]) != 0)
     if when is not None:
         visit = np.unique(when, return_inverse=True)[1]
-    visits = np.unique(np.stack([visit, data.configuration]), axis=1, return_inverse=True)[1].ravel()
+    keys = [visit, data.configuration, np.unique(data.session, return_inverse=True)[1]]
+    visits = np.unique(np.stack(keys), axis=1, return_inverse=True)[1].ravel()
+    own = np.array([data.session == name for name in set_ups(result, data) if register], float).reshape(-1, count)
+    data, motion = registered_again(result, data) if register else (data, "")
     problem = recalibration.with_data(result, replace(data, configuration=visits))
-    sizes = np.zeros(count, dtype=int)
-    for block in data.blocks:
-        sizes[block.row] = len(block.measurement.components)
     level = recalibration.FALSE_ALARM / TESTS
-    sigmas, deviate = _innovations(result, problem, level / count)
+    sigmas, deviate, sizes = _innovations(result, problem, own, level / count)
     held = held_out_errors(result, data)
     return Monitoring(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
         allowed=np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - level / count)), sums=cusum(deviate),
-        limit=cusum_limit(count, level), drift=_drift(result, problem, level),
+        limit=cusum_limit(count, level), drift=_drift(result, problem, own, level), registered=motion,
         mistake=unregistered(result, data, held)
         or misread(result, data)
         or recalibration.moved_or_changed(result, data, held)[0],
     )  # fmt: skip
 
 
-def _innovations(result: Calibration, problem: CalibrationProblem, level: float) -> tuple[Array, Array]:
-    """Return innovations of N checks in standard deviations (N,), and as standard normal deviates (N,).
+def _framed(problem: CalibrationProblem) -> tuple[CalibrationProblem, list[int]]:
+    """Return the problem with all frames identified, and the places of its bases among the deviations."""
+    framed = problem.identifying(problem.parameters.identified | problem.parameters.of_frames)
+    return framed, [i for i, name in enumerate(framed.parameters.free.names) if own_name(name).startswith("base_")]
+
+
+def _innovations(
+    result: Calibration, problem: CalibrationProblem, own: Array, level: float
+) -> tuple[Array, Array, np.ndarray]:
+    """Return innovations of N checks in standard deviations, as standard normal deviates, and their equations (N,).
 
     The calibration's error is common to all predictions. A Kalman filter takes that away as checks show it, so that
     the innovations of a robot that does not drift are independent::
@@ -209,38 +226,45 @@ def _innovations(result: Calibration, problem: CalibrationProblem, level: float)
 
     with |S^-1/2 e| in standard deviations, V the covariance of a reading, and C what calibration and earlier checks
     leave open. Deviates are by Fisher's F, positive where a check misses more than usual. The filter learns nothing
-    from a check that is less probable than ``level``.
+    from a check that is less probable than ``level``. What nothing before tells of a check, as of the first ones of a
+    set-up, of which ``own`` (s, N) has the rows, is no equation.
     """
     C = result.known_covariance
     if C is None:
         raise result.no_covariance("`validate` gives errors without intervals")
     known = np.isfinite(np.diag(C))
-    own = problem.parameters.free.scale[len(C) :]  # of sessions that the calibration does not know
+    framed, base = _framed(problem)
+    # of sessions that the calibration does not know, and of motions
+    wide = np.append(problem.parameters.free.scale[len(C) :], np.full(len(own) * len(base), MOTION))
     n = len(known)
-    C = np.pad(np.where(np.outer(known, known), C, 0.0), (0, len(own)))
-    C[n:, n:] = np.diag(own**2)
+    C = np.pad(np.where(np.outer(known, known), C, 0.0), (0, len(wide)))
+    C[n:, n:] = np.diag(wide**2)
     m = np.zeros(len(C))
     residual, slopes = problem.slopes(recalibration.previous_deviations(result, problem))
+    moves = framed.slopes(recalibration.previous_deviations(result, framed))[1][:, base]
     readings = noise_covariances(problem, result.variance_factor).reading
     rows: dict[int, tuple[Array, Array]] = {}
-    for (block, part), V in zip(by_block(problem, np.column_stack([residual, slopes])), readings, strict=True):
-        for row, equations, of_row in zip(block.row, part, np.broadcast_to(V, (len(part), *V.shape[1:])), strict=True):
-            rows[int(row)] = equations, of_row
+    for (block, part), V in zip(by_block(problem, np.column_stack([residual, slopes, moves])), readings, strict=True):
+        of_rows = zip(part, np.broadcast_to(V, (len(part), *V.shape[1:])), strict=True)
+        rows |= zip(block.row.tolist(), of_rows, strict=True)
     freedom = max(result.freedom, 1.0)
-    sigmas = np.zeros(len(rows))
-    p_values = np.ones(len(rows))
+    sigmas, p_values, sizes = np.zeros(len(rows)), np.full(len(rows), 0.5), np.zeros(len(rows), dtype=int)
     for t, (equations, V) in sorted(rows.items()):
-        J = equations[:, 1:]
+        J = np.hstack([equations[:, 1 : slopes.shape[1] + 1], np.kron(own[:, t], equations[:, slopes.shape[1] + 1 :])])
         S = J @ C @ J.T + V
         e = equations[:, 0] - J @ m
-        squares = float(e @ np.linalg.solve(S, e))
+        s, U = scipy.linalg.eigh(S, V)
+        told = s < APART
+        sizes[t] = told.sum()
+        squares = float(np.sum((U.T @ e)[told] ** 2 / s[told]))
         sigmas[t] = np.sqrt(squares)
-        p_values[t] = fdtrc(len(e), freedom, squares / len(e))
+        if sizes[t]:
+            p_values[t] = fdtrc(sizes[t], freedom, squares / sizes[t])
         if p_values[t] >= level:
             gain = np.linalg.solve(S, J @ C).T
             m = m + gain @ e
             C = C - gain @ S @ gain.T
-    return sigmas, -np.asarray(ndtri(np.clip(p_values, SMALLEST, 1 - SMALLEST)))
+    return sigmas, -np.asarray(ndtri(np.clip(p_values, SMALLEST, 1 - SMALLEST))), np.maximum(sizes, 1)
 
 
 def cusum(deviate: Array) -> Array:
@@ -265,10 +289,16 @@ def cusum_limit(count: int, level: float) -> float:
     return float(scipy.optimize.bisect(alarms, 1e-3, HIGHEST_LIMIT, xtol=1e-4))
 
 
-def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Drift | None:
-    """Return the change that explains checks best; None where chance does, over all changes that were tried."""
+def _drift(result: Calibration, problem: CalibrationProblem, own: Array, level: float) -> Drift | None:
+    """Return the change that explains checks best, set-ups moved or not; None where chance does, over all tried."""
     model = problem.linearize(recalibration.previous_deviations(result, problem))
     form = recalibration.penalty_of(recalibration.posterior_as_prior(result, problem), model.A.shape[1])
+    # a frame may have moved whether it was identified or not: else the robot's parameters are blamed for it
+    framed, base = _framed(problem)
+    free = framed.parameters.free
+    A = framed.linearize(recalibration.previous_deviations(result, framed)).A / np.sqrt(result.variance_factor)
+    model = replace(model, A=np.hstack([model.A, *(A[:, base] * rows[problem.owners, None] for rows in own)]))
+    form = replace(form, L=np.pad(form.matrix, ((0, 0), (0, len(own) * len(base)))))
     # rows of one configuration were read together: the first of them has the time
     numbers, first = np.unique(problem.data.configuration, return_index=True)
     when = first[np.searchsorted(numbers, model.group)]
@@ -278,10 +308,6 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
     courses = [(int(first), False, (when >= first).astype(float)) for first in moments]
     if count > 2:
         courses.append((0, True, when / (count - 1)))
-    # a frame may have moved whether it was identified or not: else the robot's parameters are blamed for it
-    framed = problem.identifying(problem.parameters.identified | problem.parameters.of_frames)
-    free = framed.parameters.free
-    A = framed.linearize(recalibration.previous_deviations(result, framed)).A / np.sqrt(result.variance_factor)
     width = recalibration.prior_widths(result, framed) / free.scale
     tried: list[tuple[float, Drift]] = []
     causes = recalibration.candidates(free, problem.data)

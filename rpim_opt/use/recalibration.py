@@ -36,7 +36,7 @@ from rpim_opt.robot.chain import placed, same_place
 from rpim_opt.robot.kinematics import FRAME, frame_numbers
 from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session
 from rpim_opt.store.result_file import content
-from rpim_opt.use.sessions import base_frame
+from rpim_opt.use.sessions import base_frame, registered_again
 
 FALSE_ALARM = 0.01  # probability that a robot that did not change, or does not drift, is said to, over all causes
 MULTIPLES = (1.0, 3.0, 10.0, 30.0)  # multiples of a deviation's prior width that a change may have, each as likely
@@ -295,7 +295,7 @@ def update(
     new = before = updated.problem.data
     if apart := unregistered(result, new, held_out_errors(result, new)):
         with suppress(InputError):  # few rows
-            before = registered(result, new)[0]
+            before = registered_again(result, new)[0]
             elsewhere += f"{apart.partition(':')[0]}: errors with the previous calibration are after registration."
     rows = {"new": (before, new), "held-out": (held_out, held_out)}
     errors = {key: {"before": result.errors(a), "after": updated.errors(b)} for key, (a, b) in rows.items() if a and b}

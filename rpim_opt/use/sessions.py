@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.text import listed
 from rpim_opt.calibration.held_out import registered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
@@ -41,14 +43,30 @@ def in_session(result: Calibration, robot: str = "") -> Calibration:
     return views[int(np.argmin(squares))]
 
 
+def set_ups(result: Calibration, data: Dataset) -> list[str]:
+    """Return the sessions that ``register`` is for: those that the calibration does not have, or without such, all."""
+    return sorted({*data.session} - {*result.problem.sample().data.session}) or sorted({*data.session})
+
+
 def registered_again(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
-    """Return measurements after the motion that fits them best in the frame of `in_session`, and which motion."""
-    session = in_session(result).problem.session
+    """Return measurements, those of `set_ups` after motions into the frame of `in_session`, and the motions in words.
+
+    Each session has the motion that fits its rows best. InputError as of `registered`, with the session's name.
+    """
+    session, places = in_session(result).problem.session, data.session
+    names = set_ups(result, data)
     if session:  # as rows of another one their intervals would contain the scatter of the instrument's places
-        blocks = (replace(each, session=np.full(len(each.row), session, dtype=object)) for each in data.blocks)
-        data = replace(data, blocks=tuple(blocks))
-    data, motion = registered(result, data)
-    return data, f"Registered again: the measurements were {motion}."
+        new = np.where(np.isin(places, names), session, places)
+        data = replace(data, blocks=tuple(replace(each, session=new[each.row]) for each in data.blocks))
+    motions = []
+    for name in names:
+        try:
+            data, motion = registered(result, data, places == name)
+        except InputError as error:
+            where = f"--register{f', session {name!r}' if name else ''}, {error.where}"
+            raise InputError(where, error.found, error.accepted) from None
+        motions.append(f"{f'session {name!r} was' if name else 'the measurements were'} {motion}")
+    return data, f"Registered again: {listed(motions, between='; ')}."
 
 
 def _sessions(result: Calibration, robot: str) -> dict[str, bool]:

@@ -125,6 +125,29 @@ def test_update_and_monitor_say_one_size_of_a_change() -> None:
     assert abs(moved.change - 5e-4) < 4 * moved.std
 
 
+def set_up_anew(data: ro.Dataset) -> ro.Dataset:
+    """Return checks by an instrument that stands elsewhere at each round of the places."""
+    (block,) = data.blocks
+    number = np.arange(len(data)) // PLACES
+    rng = np.random.default_rng(8)
+    turns = Rotation.from_rotvec(rng.normal(size=(len(data), 3)))[number]
+    y = turns.apply(block.y) + rng.normal(size=(len(data), 3))[number]
+    return ro.Dataset.of(block.q[:, 0], y, SIGMA, session=[f"M{i}" for i in number])
+
+
+@pytest.mark.parametrize(("checks", "first"), [(CHECKS, 12), (PLACES, 0)])
+def test_a_change_is_found_where_the_instrument_is_set_up_anew_each_time(checks: int, first: int) -> None:
+    """One motion was fitted to all set-ups; of a single one it took a part of the change, by ten deviations."""
+    result, data = checked(1, np.zeros(checks))
+    assert not ro.use.monitor(result, set_up_anew(data), register=True).drifts
+    result, data = checked(1, np.where(np.arange(checks) >= first, 2e-3, 0.0))
+    drift = ro.use.monitor(result, set_up_anew(data), register=True).drift
+    assert drift is not None
+    assert (drift.cause.name, drift.first) == ("theta3", first)
+    assert drift.moved is not None
+    assert abs(drift.moved.change - 2e-3) < 3 * drift.moved.std
+
+
 def test_one_wrong_check_is_named() -> None:
     result, data = checked(0, np.zeros(CHECKS))
     block = data.blocks[0]

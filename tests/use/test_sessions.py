@@ -135,6 +135,25 @@ def test_measurements_from_a_third_place_are_judged_by_the_robots_uncertainty_on
     assert any("Registered again" in remark for remark in found.remarks)
 
 
+def test_every_set_up_is_registered_by_itself(arm: ro.study.SimulatedArm, result: ro.Calibration) -> None:
+    """One motion was fitted to the rows of all of them: errors were as large as the places are apart."""
+    y = arm.read.blocks[0].y[:24].copy()
+    for k, rows in enumerate(np.split(np.arange(24), 3)):
+        place = numeric_frame([1.0 - k, 0.2 * k, -0.1, 0.01, 0.02, 0.9 * k - 0.5])
+        y[rows] = y[rows] @ place[:3, :3].T + place[:3, 3]
+    data = ro.Dataset.of(arm.read.q[:24], y, NOISE, session=[f"M{1 + i // 8}" for i in range(24)])
+    found = ro.use.validate(result, data, register=True)
+    assert 1e3 * found.error.max() < 0.2  # a reading is within 0.02 mm, and the arm's repeatability
+    assert not found.mistake
+    assert str(found).count("was displaced as a whole by") == 3
+    monitored = ro.use.monitor(result, data, register=True)
+    assert not monitored.drifts
+    assert "session 'M3' was displaced" in str(monitored)
+    few = data.take([*range(8), 8, 9])
+    with pytest.raises(ro.InputError, match="session 'M2', measured positions: found 2"):
+        ro.use.validate(result, few, register=True)
+
+
 def test_a_third_place_is_no_change_of_the_robot_and_says_nothing_of_it_before_it_is_registered(
     arm: ro.study.SimulatedArm, result: ro.Calibration
 ) -> None:
