@@ -332,17 +332,17 @@ def _write_urdf(
     known = reflectors(p.names)
     if tip_measured and marker is None and len(known) > 1:
         raise InputError("--tip-measured", f"{len(known)} reflectors", f"--marker with one of {', '.join(known)}")
-    of_base, of_tool = (any(name.startswith(frame) for name in p.free.names) for frame in ("base_", "tool_"))
+    of_base, of_tool, of_session = (any(n.startswith(f) for n in p.free.names) for f in ("base_", "tool_", "session_"))
     base = arm.base if of_base and same_place(arm.base, own.base) else None
     tool = arm.tool if of_tool and tip_measured else None
     notes = []
+    frame = "the instrument's frame" + (result.problem.session and f" of session '{result.problem.session}'")
     if base is not None:
-        notes.append(f"URDF: {root} is at the identified base, {placed(base)} in the instrument's frame.")
-    elif of_base:
+        notes.append(f"URDF: {root} is at the identified base, {placed(base)} in {frame}.")
+    elif of_base or of_session:
         at = placed(frame_numbers(numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))))
         notes.append(
-            f"URDF: {root} is at {at} in the instrument's frame. Use this pose with the corrected origins, not an "
-            "earlier one."
+            f"URDF: {root} is at {at} in {frame}. Use this pose with the corrected origins, not an earlier one."
         )
     if tool is not None:
         moved = 1e3 * np.linalg.norm(tool[:3] - own.tool[:3])

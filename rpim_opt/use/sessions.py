@@ -121,6 +121,6 @@ def session_notes(result: Calibration, robot: str = "") -> list[str]:
         listed[i] += f" (positions there relative to '{here}': U, k = 2, at most {U:.3g} mm where it was measured)"
     more = f"; {len(names) - FEW} more in the result" if len(names) > FEW else ""
     return [
-        f"Positions and their U are in the instrument's frame of session '{here}'. Base in the frame of sessions: "
-        f"{'; '.join(listed)}{more}."
+        f"Positions and their U are in the instrument's frame of session '{here}'. Base of the DH table in the frame "
+        f"of sessions: {'; '.join(listed)}{more}."
     ]

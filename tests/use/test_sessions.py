@@ -15,11 +15,13 @@ import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.calibration.acceptance import measured_workspace
-from rpim_opt.robot.kinematics import numeric_frame
+from rpim_opt.robot.chain import placed
+from rpim_opt.robot.kinematics import frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import model_parameters
 from rpim_opt.study.arms import BASE, KINDS, SCALES, TOOL
 from tests import ROOT
 from tests.test_cli import run
+from tests.test_commands import urdf_text
 
 NOISE = 3e-5
 FAR = numeric_frame([0.4, -0.9, 0.1, 0.02, -0.03, 0.5])  # from the instrument's first place to its second
@@ -109,7 +111,7 @@ def test_the_commands_that_judge_a_robot_judge_it_in_one_session(
     (tmp_path / "new.csv").write_text(csv_text(header, cells))
     new = ("--data", str(tmp_path / "new.csv"))
     assert run(monkeypatch, "accept", str(tmp_path), "--limit", "0.5", *new) == 0
-    assert "Base in the frame of sessions: " in capsys.readouterr().out
+    assert "Base of the DH table in the frame of sessions: " in capsys.readouterr().out
     assert run(monkeypatch, "accept", str(tmp_path), *new, "--json") == 0
     assert json.loads(capsys.readouterr().out)["session"] in ("near", "far")
     assert run(monkeypatch, "report", str(tmp_path), *new) == 0
@@ -229,6 +231,18 @@ def test_new_registers_sessions_that_stand_apart_by_themselves(
     view = ro.use.in_session(result)
     assert view.verdict.delivered
     assert 2 * np.median(np.linalg.norm(view.predict(arm.true.q, of="reached").standard, axis=1)) < 1.5e-4
+    # where the root of a URDF is, which stands on a floor, in that session; the DH table's base is on the pedestal
+    root = '<link name="floor"/><joint name="pedestal" type="fixed"><parent link="floor"/><child link="base_link"/>'
+    root += '<origin xyz="0.5 0.2 0" rpy="0 0 0"/></joint></robot>'
+    text = urdf_text(arm.problem.robot.mdh, np.eye(4)).replace("</robot>", root)
+    (tmp_path / "arm.urdf").write_text(text)
+    exported = ["export", str(tmp_path / "cell"), "--urdf", f"{tmp_path}/arm.urdf", "--out", f"{tmp_path}/out.urdf"]
+    ro.store.save_result(result, cell)
+    assert run(monkeypatch, *exported) in (0, 4)
+    there = numeric_frame(ro.use.identified(result).base) @ numeric_frame([-0.5, -0.2, 0.0, 0.0, 0.0, 0.0])
+    at = f"floor is at {placed(frame_numbers(there))} in the instrument's frame of session '{view.problem.session}'"
+    for said in (capsys.readouterr().out, (tmp_path / "out.urdf").read_text()):
+        assert at in " ".join(said.split())
     # a tracker that was moved since then, under the name of a session, is no change of the robot (it was one of a1)
     y = arm.read.blocks[0].y[:12] + np.array([5e-3, 0.0, 0.0])
     later = ro.Dataset.of(arm.read.q[:12], y, NOISE, session=["near"] * 12)
