@@ -181,41 +181,47 @@ def run_study(
     ``results/NAME-quick`` beside the study.
     """
     path = find_study(name)
-    pyarrow = library("pyarrow", "the study", "studies")
-    parquet = library("pyarrow.parquet", "the study", "studies")
     study = load_study(path)
     folder = out or path.parent / "results" / _label(path, quick)
-    folder.mkdir(parents=True, exist_ok=True)
-    if redraw:
-        path = folder / f"{REPLICATES}.parquet"
-        if not path.exists():
-            raise InputError("redraw", "no replicates", "a study that was run before", path)
-        require_file(path, LARGEST_DATA)
-        try:
-            table = parquet.read_table(path)
-            made = (table.schema.metadata or {}).get(b"made", b"").decode()
-        except (OSError, ValueError) as error:
-            raise InputError("redraw", str(error), "the replicates of a study", path) from None
-        # without what a replicate does not have
-        report = study.report([{key: v for key, v in row.items() if v is not None} for row in table.to_pylist()])
-        write(folder, study.QUESTION, report, made, {})
-        return report, folder
+    table = folder / f"{REPLICATES}.parquet"
+    if not redraw:
+        _replicate(path, study, quick, workers, resume, table, progress)
+    parquet = library("pyarrow.parquet", "the study", "studies")
+    if not table.exists():
+        raise InputError("redraw", "no replicates", "a study that was run before", table)
+    require_file(table, LARGEST_DATA)
+    try:
+        rows = parquet.read_table(table)
+        made = (rows.schema.metadata or {}).get(b"made", b"").decode()
+    except (OSError, ValueError) as error:
+        raise InputError("redraw", str(error), "the replicates of a study", table) from None
+    # without what a replicate does not have
+    report = study.report([{key: v for key, v in row.items() if v is not None} for row in rows.to_pylist()])
+    write(folder, study.QUESTION, report, made)
+    return report, folder
+
+
+def _replicate(
+    path: Path, study: ModuleType, quick: bool, workers: int, resume: bool | None, file: Path, progress: Progress
+) -> None:
+    """Write the replicates of a study to a Parquet file, from which the report is made, now or again."""
+    pyarrow = library("pyarrow", "the study", "studies")
+    parquet = library("pyarrow.parquet", "the study", "studies")
+    file.parent.mkdir(parents=True, exist_ok=True)
     if hasattr(study, "prepare"):
         study.prepare(quick)
     cases = study.cases(quick)
     files = files_of(path, study)
     made = made_by(path, quick, len(cases), files)  # of what is here now, whatever becomes of it meanwhile
-    code = {**{f"file {file}": digest for file, digest in files.items()}, **package_code()}
-    journal = folder / f"{REPLICATES}.jsonl"
+    code = {**{f"file {each}": digest for each, digest in files.items()}, **package_code()}
+    journal = file.with_suffix(".jsonl")
     rows = run_cases(cases, lambda case: partial(_run, path, case), workers, progress, journal, code, resume)
-    report = study.report(rows)
     columns = list(dict.fromkeys(key for row in rows for key in row))
     table = pyarrow.table({key: [row.get(key) for row in rows] for key in columns})
     stream = io.BytesIO()
     parquet.write_table(table.replace_schema_metadata({"made": made}), stream)
-    write(folder, study.QUESTION, report, made, {f"{REPLICATES}.parquet": stream.getvalue()})
+    write_files({file: stream.getvalue()})
     journal.unlink()
-    return report, folder
 
 
 def _run(path: Path, case: Mapping[str, Any]) -> Row:
@@ -226,11 +232,11 @@ def _run(path: Path, case: Mapping[str, Any]) -> Row:
     return row
 
 
-def write(folder: Path, question: str, report: Report, made: str, replicates: Mapping[str, bytes]) -> None:
-    """Write ``README.md`` with the figures, ``metrics.json`` and the file of the replicates: all, or none."""
+def write(folder: Path, question: str, report: Report, made: str) -> None:
+    """Write ``README.md`` with the figures, and ``metrics.json``: all, or none."""
     pictures = [f"![{title}]({title}.svg)\n" for title in report.figures]
     text = "\n".join([f"# {question}", "", report.text.strip(), "", *pictures, made])
-    files = {"README.md": f"{text}\n".encode(), "metrics.json": json_text(dict(report.metrics)).encode(), **replicates}
+    files = {"README.md": f"{text}\n".encode(), "metrics.json": json_text(dict(report.metrics)).encode()}
     for (title, figure), kind in product(report.figures.items(), ("svg", "png")):
         from matplotlib import rc_context  # which nothing but a figure needs
 

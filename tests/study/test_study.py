@@ -230,6 +230,23 @@ def test_a_report_is_redrawn_from_the_replicates(toy, tmp_path: Path) -> None:
         run_study("toy", out=tmp_path / "empty", redraw=True)
 
 
+def test_a_report_that_fails_leaves_its_replicates(toy, tmp_path: Path) -> None:
+    """They were lost: neither --resume nor --redraw took them, as the file had to be corrected."""
+    file = toy() / "toy.py"
+    right = file.read_text()
+    file.write_text(right.replace("def report(rows):", "def report(rows):\n    rows.groupby('seed')"))
+    studies.load_study.cache_clear()
+    with pytest.raises(AttributeError):
+        run_study("toy", out=tmp_path / "out")
+    computed = (tmp_path / "log.txt").read_text()
+    file.write_text(right)
+    studies.load_study.cache_clear()
+    report, folder = run_study("toy", out=tmp_path / "out", redraw=True)
+    assert report.metrics
+    assert (folder / "README.md").exists()
+    assert (tmp_path / "log.txt").read_text() == computed
+
+
 def interrupted(toy, out: Path) -> Path:
     """Return the journal of a study that was stopped."""
     toy(stop=True)
