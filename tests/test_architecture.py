@@ -156,9 +156,8 @@ UNUSED = {
     "--help": LINEAR,
     "calibrate --help": LINEAR - {"pydantic"},
     "robots": {"cvxpy", "clarabel", "scipy.stats", "scipy.optimize", "scipy.sparse"},
-    # closed forms and active sets: CVXPY is there when ``program.problem`` is asked for
+    # closed forms: CVXPY is there when ``program.problem`` is asked for
     SMALL: {*HEAVY, *ELSEWHERE},
-    f"{SMALL} --variant bounded": {*HEAVY, *ELSEWHERE},
     f"{SMALL} --selector learned": {*HEAVY, *ELSEWHERE},
     "inspect paper_arm": HEAVY,
 }

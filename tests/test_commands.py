@@ -233,9 +233,10 @@ def test_real_measurements(monkeypatch, tmp_path, name: str, robot: str, limit: 
     source, folder = REAL / name, tmp_path / "arm"
     assert run(monkeypatch, "new", str(folder), "--robot", robot or str(source / "robot.toml"), "--data",
                str(source / "identification.csv"), "--validation", str(source / "validation.csv")) == 0  # fmt: skip
-    assert run(monkeypatch, "calibrate", str(folder), "--out", str(folder / "results")) == 0
+    code = 4 * (name == "wam_jacobi")  # of the wam alone U is above the nominal error
+    assert run(monkeypatch, "calibrate", str(folder), "--out", str(folder / "results")) == code
     assert json.loads((folder / "results" / "result.json").read_text())["validation"]["rms_mm"] < limit
-    assert run(monkeypatch, "export", str(folder / "results"), "--mdh", str(tmp_path / "arm.csv")) == 0
+    assert run(monkeypatch, "export", str(folder / "results"), "--mdh", str(tmp_path / "arm.csv")) == code
     assert ro.read_robot(tmp_path / "arm.csv").dof == ro.load_result(folder / "results").robot.dof
     assert run(monkeypatch, "report", str(folder / "results")) == 0
 
@@ -453,7 +454,7 @@ def test_two_units_that_are_wrong_are_both_named(monkeypatch, capsys, cell, tmp_
     arguments = ["--robot", str(cell / "arm.urdf"), "--data", str(cell / "measured.csv"), "--units", "deg,mm"]
     assert run(monkeypatch, "new", str(tmp_path / "arm"), *arguments) == 0
     capsys.readouterr()
-    assert run(monkeypatch, "inspect", str(tmp_path / "arm")) == 0
+    assert run(monkeypatch, "inspect", str(tmp_path / "arm")) == 1
     (said,) = [line for line in capsys.readouterr().out.splitlines() if "times better" in line]
     lengths, turns = "measured lengths a thousand times larger", "joint values read as radians, not degrees"
     assert f"{lengths} and {turns}: " in said or f"{turns} and {lengths}: " in said
@@ -464,7 +465,7 @@ def test_a_title_without_a_source_has_no_empty_line_below(monkeypatch, capsys, m
         assert run(monkeypatch, command, str(made)) == 0
         title, empty, first, *_ = capsys.readouterr().out.splitlines()
         assert (title, empty) == ("arm", "")
-        assert first.split()[:2] in (["joint", "unit"], ["On", "8"])
+        assert first.split()[:2] in (["joint", "unit"], ["Delivered:", "the"])
 
 
 def test_what_the_uncertainty_allows_is_rarely_exceeded() -> None:

@@ -560,7 +560,9 @@ def _mistakes(points: Points, stated: float) -> tuple[list[Misreading], float]:
     enough = min(BETTER * stated, WRONG)
     chain, best = _chain(points, stated, readings, enough, MISTAKES[points.seen])
     if stated > WRONG and not points.seen and best >= enough:
-        for i in np.argsort(_tried(points, readings))[:12]:
+        # another unit of lengths alone may be no better, as that of angles beside it is wrong, too
+        units = [i for i, each in enumerate(readings) if each.what.startswith("measured lengths a thousand")]
+        for i in dict.fromkeys([*units, *np.argsort(_tried(points, readings))[:12].tolist()]):
             changed = readings[i].change(points)
             others = [each for each in _readings(changed) if each.what != readings[i].what]
             second, left = _best(changed, others)
