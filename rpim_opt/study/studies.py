@@ -197,7 +197,7 @@ def run_study(
         raise InputError("redraw", str(error), "the replicates of a study", table) from None
     # without what a replicate does not have
     report = study.report([{key: v for key, v in row.items() if v is not None} for row in rows.to_pylist()])
-    write(folder, study.QUESTION, report, made)
+    write(folder, study.QUESTION, report, made, {})  # which were there before
     return report, folder
 
 
@@ -232,11 +232,11 @@ def _run(path: Path, case: Mapping[str, Any]) -> Row:
     return row
 
 
-def write(folder: Path, question: str, report: Report, made: str) -> None:
-    """Write ``README.md`` with the figures, and ``metrics.json``: all, or none."""
+def write(folder: Path, question: str, report: Report, made: str, replicates: Mapping[str, bytes]) -> None:
+    """Write ``README.md`` with the figures, ``metrics.json`` and the file of the replicates: all, or none."""
     pictures = [f"![{title}]({title}.svg)\n" for title in report.figures]
     text = "\n".join([f"# {question}", "", report.text.strip(), "", *pictures, made])
-    files = {"README.md": f"{text}\n".encode(), "metrics.json": json_text(dict(report.metrics)).encode()}
+    files = {"README.md": f"{text}\n".encode(), "metrics.json": json_text(dict(report.metrics)).encode(), **replicates}
     for (title, figure), kind in product(report.figures.items(), ("svg", "png")):
         from matplotlib import rc_context  # which nothing but a figure needs
 

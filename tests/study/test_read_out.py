@@ -132,7 +132,7 @@ def test_figures_of_a_study_stand_beside_its_text(tmp_path: Path) -> None:
         figure.subplots().plot([0, 1])
         figures.append(figure)
     for folder, figure in zip(("one", "two"), figures, strict=True):
-        write(tmp_path / folder, "Why?", Report("Because.", {"n": 1}, {"curve": figure}), "")
+        write(tmp_path / folder, "Why?", Report("Because.", {"n": 1}, {"curve": figure}), "", {})
     assert sorted(path.name for path in (tmp_path / "one").iterdir()) == [
         "README.md", "curve.png", "curve.svg", "metrics.json",
     ]  # fmt: skip
