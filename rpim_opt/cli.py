@@ -604,11 +604,12 @@ def compensate(
     console.require_positive("--limit", limit)
     mass, centre = console.payload_of(payload)
     with _loaded(result) as (loaded, say):
-        read, understood = ro.use.read_targets(loaded, targets, tables.options)
+        at = console.tool_frame(tool)
+        read, understood = ro.use.read_targets(loaded, targets, tables.options, at, marker or "")
         say("compensating")
         compensation = ro.use.compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=orientation,
-            tool=console.tool_frame(tool), marker=marker or "", base=base, largest=largest,
+            tool=at, marker=marker or "", base=base, largest=largest,
             payload=read.payload if mass is None else mass, payload_centre=centre, despite_verdict=despite_verdict,
             limit=None if limit is None else 1e-3 * limit,
         )  # fmt: skip

@@ -23,7 +23,7 @@ from rpim_opt.problem.registration.closed_forms import proper, transforms
 from rpim_opt.problem.registration.global_start import QUARTER, UNEXPLAINED, WRITE, JointMapping, explained, search
 from rpim_opt.problem.registration.points import Points, fit_points, lengths_of, mirrored, misfit, misfits, points_of
 from rpim_opt.robot.formats.tables import read_robot
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
 
@@ -100,21 +100,26 @@ class Better(NamedTuple):
         return f"the data fit {times} times better, {figures}, with {self.what}: {self.remedy}.{alike}"
 
 
-def pose_misfit(robot: Robot, data: Dataset) -> float:
+def pose_misfit(robot: Robot, data: Dataset, tool: Array | None = None) -> float:
     """Return the RMS angle [rad] between measured and nominal orientations of the data's first block of poses.
 
-    Base and tool are fitted; pi where the poses do not determine them.
+    Base and tool are fitted; pi where the poses do not determine them. With a ``tool`` (6,) they are in the robot's
+    base.
     """
     block = next(each for each in data.blocks if each.measurement.name == "pose")
     measured = transforms(block.y)
     flange = forward_kinematics(robot, block.q[:, 0])
-    try:
-        start = certified_hand_eye(flange, measured)
-    except InputError:  # two poses
-        return float(np.pi)
-    if start.uncertainty > UNKNOWN:
-        return float(np.pi)
-    error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (start.base @ flange @ start.tool)[:, :3, :3]
+    if tool is None:
+        try:
+            start = certified_hand_eye(flange, measured)
+        except InputError:  # two poses
+            return float(np.pi)
+        if start.uncertainty > UNKNOWN:
+            return float(np.pi)
+        nominal = start.base @ flange @ start.tool
+    else:
+        nominal = flange @ numeric_frame(tool)
+    error = np.swapaxes(measured[:, :3, :3], 1, 2) @ nominal[:, :3, :3]
     return float(np.sqrt(np.mean(Rotation.from_matrix(error).magnitude() ** 2)))
 
 

@@ -29,6 +29,7 @@ from rpim_opt.problem.misreadings import pose_misfit
 from rpim_opt.robot.chain import RobotSetup
 
 CLEARLY = 3.0  # The right reading of orientations, or mounting of a camera, leaves so many times less than another.
+ALIKE = 1.0  # Angle [deg] from the nominal robot's up to which targets have the orientation of their joint values.
 USUAL = "extrinsic xyz"
 SINCE_1970 = 1e8  # times [s] that are larger; others may begin at zero in every file
 READINGS = {
@@ -124,7 +125,7 @@ def understand_of(
     options: TableOptions | None = None,
     targets: bool = False,
 ) -> Understanding:
-    """Interpret raw tables (files or data frames) of measurements, or of targets, as one table."""
+    """Interpret raw tables (files or data frames) of measurements, or of targets of the arm's tool, as one table."""
     options = options or TableOptions()
     files = [(path, _upright(raw, arm)) for path, raw in _read(data, options)]
     known = pick(MEASUREMENTS, measurement, "measurement") if isinstance(measurement, str) else measurement
@@ -136,8 +137,9 @@ def understand_of(
         stems = set().union(*(each.stems for each in tables))
         if known or any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms))):
             understanding = _whole(files, arm, kind, options, tables)
-            doubt = next((each.doubt for each in tables if each.doubt and kind.turning and not targets), "")
-            return _checked(understanding, files, arm, doubt) if doubt else understanding
+            wanted = ("rotation",) * ("q1" in stems) if targets else tuple(READINGS)
+            doubt = next((each.doubt for each in tables if each.doubt in wanted and kind.turning), "")
+            return _checked(understanding, files, arm, doubt, targets) if doubt else understanding
     names = ", ".join(name for _, raw in files for name in raw.columns)
     sheets = [note.rstrip(".") for _, raw in files for note in raw.notes if note.startswith("sheet '")]
     accepted = "; ".join([f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}", *sheets])
@@ -225,22 +227,27 @@ def _with_meaning(tables: Sequence[Understood], columns: Sequence[str], **new: s
     return tuple(replace(table, meant=tuple(map(updated, table.meant))) for table in tables)
 
 
-def _checked(first: Understanding, files: Files, arm: RobotSetup, doubt: str) -> Understanding:
+def _checked(first: Understanding, files: Files, arm: RobotSetup, doubt: str, targets: bool) -> Understanding:
     """Return poses with the order of a quaternion that fits the nominal robot; refuse turns that are not as usual."""
     alternatives: dict[str, Understanding] = {}
     misfit: dict[str, float] = {}
     noise = {"position_mm": 1.0, "orientation_mrad": 1.0}
     for reading in READINGS[doubt]:
         options = replace(first.options, **{doubt: reading})
-        alternatives[reading] = _whole(files, arm, first.kind, options, _tables(files, arm, first.kind, options))
+        alternatives[reading] = _whole(
+            files, arm, first.kind, options, _tables(files, arm, first.kind, options, targets)
+        )
         data = read_data(alternatives[reading].columns, arm.robot, noise, first.kind)
-        misfit[reading] = float(np.degrees(pose_misfit(arm.robot, data)))
+        misfit[reading] = float(np.degrees(pose_misfit(arm.robot, data, arm.tool if targets else None)))
+        if targets and misfit[USUAL] <= ALIKE:
+            return first
     best, second = sorted(misfit, key=lambda reading: misfit[reading])[:2]
     figures = ", ".join(f"{reading} {misfit[reading]:.2f} deg" for reading in (best, second))
     if doubt == "rotation":
-        if misfit[USUAL] <= CLEARLY * misfit[best]:
+        if misfit[USUAL] <= CLEARLY * misfit[best] or (targets and misfit[best] > ALIKE):
             return first
-        missed = f"rotations with nominal errors of {misfit[USUAL]:.2f} deg as {USUAL}, and {figures}"
+        how = "that differ from the nominal ones at the stated joint values by" if targets else "with nominal errors of"
+        missed = f"rotations {how} {misfit[USUAL]:.2f} deg as {USUAL}, and {figures}"
         accepted = f"--rotation '{best}' if correct, or '{USUAL}'"
         raise InputError("rx, ry, rz", missed, accepted, first.file)
     if misfit[second] <= CLEARLY * misfit[best]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,8 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.robot.chain import RobotSetup
+from rpim_opt.robot.kinematics import FRAME
+from rpim_opt.robot.parameters import reflectors, tool_prefix
 from rpim_opt.store.raw import Understanding, rows_of, understand_of
 from rpim_opt.use.sessions import registered_again
 
@@ -40,14 +43,19 @@ class Targets(NamedTuple):
 
 
 def read_targets(
-    result: Calibration, source: Any, options: TableOptions | None = None
+    result: Calibration,
+    source: Any,
+    options: TableOptions | None = None,
+    tool: Sequence[float] | Array | None = None,
+    marker: str = "",
 ) -> tuple[Targets, Understanding]:
     """Return the targets of a table, whose columns are recognized by name, and what was understood of it.
 
     Columns are joint values (``q1_deg``, ...), positions in the robot's base (``x_mm, y_mm, z_mm``), with
     ``qw, qx, qy, qz``, ``rx_deg, ry_deg, rz_deg`` or ``r11`` to ``r33`` poses, or both: joint values are then where to
     look for those of the pose. Optional: ``label``, torques ``tau1_Nm``, ..., ``payload_kg``. ``source`` and
-    ``options`` are as for `read_measurements`.
+    ``options`` are as for `read_measurements`, ``tool`` and ``marker`` as for `compensate`: turns that are only in
+    another convention those of the joint values beside them are refused.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
@@ -55,8 +63,11 @@ def read_targets(
     >>> targets.label, targets.q, targets.poses
     (('P1',), None, array([[0.4, 0. , 0.5]]))
     """
-    understanding = _understood(result, source, pose, options or TableOptions(), targets=True)
-    robot = result.problem.robot
+    robot, values = result.problem.robot, result.problem.parameters.by_name(result.x)
+    known = reflectors(list(values))
+    if tool is None:
+        tool = [values[tool_prefix(marker if marker in known else known[0]) + axis] for axis in FRAME]
+    understanding = _understood(result, source, pose, options or TableOptions(), np.asarray(tool, dtype=float))
     columns = dict(understanding.columns)
     stems = {split_unit(name)[0] for name in columns}
     joints = not stems.isdisjoint(f"q{i}" for i in range(1, robot.dof + 1))
@@ -163,18 +174,24 @@ def read_measurements(
 
 
 def _understood(
-    result: Calibration, source: Any, kind: Measurement, stated: TableOptions, targets: bool = False
+    result: Calibration, source: Any, kind: Measurement, stated: TableOptions, tool: Array | None = None
 ) -> Understanding:
-    """Return the content of tables, read as the calibration's own were; where that does not fit, by their headers."""
+    """Return the content of tables, read as the calibration's own were; where that does not fit, by their headers.
+
+    They are measurements, or targets of a tool (6,).
+    """
     sources = source if isinstance(source, list | tuple) else [source]
     reading = dict(result.record.reading)
     if not all(Path(str(each)).suffix.lower() in EXCEL for each in sources):
         reading.pop("sheet", None)
     options = TableOptions.stated({**reading, **stated.texts()})
-    arm = RobotSetup(result.problem.robot, names=options.joints)
+    targets = tool is not None
+    arm = RobotSetup(result.problem.robot, tool=np.zeros(6) if tool is None else tool, names=options.joints)
     try:
         return understand_of(arm, sources, kind, options, targets)
-    except InputError:
+    except InputError as error:
+        if error.where == "rx, ry, rz":  # which no other reading of the table answers
+            raise
         with suppress(InputError):  # one that has our names already
             return understand_of(replace(arm, names=()), sources, kind, stated, targets)
         raise

@@ -536,6 +536,29 @@ def test_tables_of_targets_in_and_of_commands_out(tmp_path: Path, orientation: s
     assert "6 targets" in str(again)
 
 
+def test_turns_in_another_convention_than_that_of_the_joint_values_beside_them_are_refused(tmp_path: Path) -> None:
+    """Read as roll, pitch, yaw, Universal Robots' rotation vectors turn the tool by tens of degrees."""
+    result, q = known("six axes"), commands(ARM, 6)
+    poses = nominal_poses(result, q)
+    turns = Rotation.from_quat(poses[:, [4, 5, 6, 3]])
+    head = ["label", *(f"q{i}_rad" for i in range(1, 7)), "x_mm", "y_mm", "z_mm", *(f"R{a} [rad]" for a in "XYZ")]
+    table = tmp_path / "targets.csv"
+    accepted = {"vector": turns.as_rotvec(), "intrinsic zyz": turns.as_euler("ZYZ"), "": turns.as_euler("xyz")}
+    for rotation, angles in accepted.items():
+        write(table, head, np.hstack([q, 1e3 * poses[:, :3], angles]))
+        options = ro.data.TableOptions(rotation=rotation)
+        assert misses(ro.use.read_targets(result, table, options)[0].poses, poses)[1].max() < 1e-7
+    for count in (1, 6):  # one row is enough: the tool is known
+        write(table, head, np.hstack([q, 1e3 * poses[:, :3], accepted["vector"]])[:count])
+        with pytest.raises(ro.InputError, match=r"as extrinsic xyz, and vector 0\.00 deg, .*rotation 'vector' if"):
+            ro.use.read_targets(result, table)
+    # joint values of other poses tell nothing of the convention; nor do those of another tool
+    write(table, head, np.hstack([q[::-1], 1e3 * poses[:, :3], accepted["vector"]]))
+    assert len(ro.use.read_targets(result, table)[0].label) == 6
+    write(table, head, np.hstack([q, 1e3 * poses[:, :3], accepted["vector"]]))
+    assert len(ro.use.read_targets(result, table, tool=[0, 0, 0, 0.5, 0.2, 0])[0].label) == 6
+
+
 def write(path: Path, head: list[str], values: np.ndarray) -> None:
     lines = [",".join(filter(None, head))]
     lines += [",".join(["ABCDEF"[i], *(repr(float(v)) for v in row)]) for i, row in enumerate(values)]
