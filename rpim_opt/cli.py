@@ -157,6 +157,7 @@ UrKinematics = Annotated[File, Option(help="kinematics.yaml of ROS for a Univers
 CONF = "calibration.conf copied from a Universal Robot's controller; corrected file to --out."
 Convention = Annotated[str, Option(help="Convention of --mdh: modified (Craig), or standard (Paul, Hayati; .csv).")]
 TIP = "The reflector is the tip link: write its identified pose."
+PERMITTED = "Largest permitted error [mm]: exit code 1 if exceeded; default: the result's limit."
 REMAINING = "Largest residual error plus its U (k = 2) [mm]: exit code 1 above; default: the result's limit."
 ORIENTATION = "Correct orientations, or ignore them; default: correct if known better than the nominal ones."
 Workers = Annotated[int, Option(help="Number of parallel processes.")]
@@ -418,7 +419,7 @@ def validate(
     data: Annotated[list[Path], Argument(help=f"New measurements; {Several}")],
     tables: Tables = TABLES,
     measurement: Kind = None,
-    limit: Annotated[Number, Option(help="Largest permitted error [mm]; exit code 1 if exceeded.")] = None,
+    limit: Annotated[Number, Option(help=PERMITTED)] = None,
     register: Register = False,
     out: Table = None,
 ) -> Answer:
@@ -435,6 +436,8 @@ def validate(
     with _loaded(result) as (loaded, _):
         read = ro.use.read_measurements(loaded, data, measurement, tables.options)
         validation = ro.use.validate(loaded, read.data, register)
+    if limit is None and loaded.record.requirement is not None:
+        limit = 1e3 * loaded.record.requirement.limit
     text, within = _against(limit, "error", validation.largest)
     document = {**validation.content(), "limit_mm": limit, "within_limit": within}
     failed = within is False or validation.failure

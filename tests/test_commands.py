@@ -410,6 +410,12 @@ def test_a_saved_result_on_new_measurements(monkeypatch, capsys, cell, made, tmp
         written = list(csv.DictReader(stream))
     assert [float(row["error_mm"]) for row in written] == pytest.approx(1e3 * error, abs=1e-6)
     assert run(monkeypatch, *arguments, "--limit", "0.01") == 1
+    capsys.readouterr()
+    record = replace(result.record, requirement=ro.data.Requirement(limit=1e-5))
+    ro.store.save_result(replace(result, record=record), tmp_path / "limited.json")
+    assert run(monkeypatch, "validate", str(tmp_path / "limited.json"), *arguments[2:]) == 1
+    assert "above the limit of 0.01 mm" in capsys.readouterr().out  # that of the result
+    assert run(monkeypatch, "validate", str(tmp_path / "limited.json"), *arguments[2:], "--limit", "0.1") == 0
 
 
 def test_a_row_that_the_prediction_does_not_allow_is_named(monkeypatch, capsys, cell, made, tmp_path) -> None:
