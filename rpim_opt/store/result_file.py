@@ -115,10 +115,9 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
         if model is None:
             model = Model([own_object(term, Term, "key record.terms", path) for term in file.record.terms])
         result = _calibration(file, ready, model)
-        first = 2 if file.record.earlier else 1  # recalibrations were once written with other nominal frames
         for name, rows in _rows(result).items():
             for before, now in zip(file.rows.get(name, ()), rows, strict=True):
-                errors = np.array([before[first:], now[first:]], dtype=float)  # NaN for none
+                errors = np.array([before[1:], now[1:]], dtype=float)  # NaN for none
                 if before.label == now.label and np.allclose(*errors, rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True):
                     continue
                 accepted = f"{now.identified_mm} mm, which follows from the file's data, terms and measurement models"
