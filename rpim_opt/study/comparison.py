@@ -433,6 +433,20 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
     return middle, float(np.exp(low)), float(np.exp(high))
 
 
+def _peaked(rows: Rows) -> Iterator[str]:
+    """Say on which problems few held-out rows make every method's RMS error."""
+    peaks: dict[Pair, list[float]] = {}
+    for row in rows:
+        if row.get("rms_mm") and row.get("mean_mm"):
+            peaks.setdefault(tuple(row[name] for name in SAME_DATA), []).append(row["rms_mm"] / row["mean_mm"])
+    peaked = list(dict.fromkeys(pair[0] for pair, each in peaks.items() if min(each) > PEAKED))
+    if peaked:
+        yield (
+            f"On {listed(peaked, 4)} the RMS error is above {PEAKED:g} times the mean with every method: few held-out "
+            "rows make it. Leave out those that are outliers, or compare by mean_mm."
+        )
+
+
 def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> Iterator[str]:
     """Yield the notes below the table: of what the ratios and intervals speak, and what has no results."""
     yield f"Ratios compare the same replicates in pairs; geometric mean over problems; a tie is within {TIE:.0%}."
@@ -452,16 +466,7 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         yield text
     elif len(standings) > 1:
         yield f"There are no intervals: fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one."
-    peaks: dict[Pair, list[float]] = {}
-    for row in rows:
-        if row.get("rms_mm") and row.get("mean_mm"):
-            peaks.setdefault(tuple(row[name] for name in SAME_DATA), []).append(row["rms_mm"] / row["mean_mm"])
-    peaked = list(dict.fromkeys(pair[0] for pair, each in peaks.items() if min(each) > PEAKED))
-    if peaked:
-        yield (
-            f"On {listed(peaked, 4)} the RMS error is above {PEAKED:g} times the mean with every method: few held-out "
-            "rows make it. Leave out those that are outliers, or compare by mean_mm."
-        )
+    yield from _peaked(rows)
     every = Counter(row["method"] for row in rows)
     without: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:

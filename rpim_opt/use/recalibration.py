@@ -292,19 +292,28 @@ def update(
         prior_inflation, released, left_out,
     )  # fmt: skip
     held_out = None if released else result.record.validation  # which was measured before a change
-    new = before = updated.problem.data
-    if apart := unregistered(result, new, held_out_errors(result, new)):
-        with suppress(InputError):  # few rows
-            before = registered_again(result, new)[0]
-            elsewhere += f"{apart.partition(':')[0]}: errors with the previous calibration are after registration."
-    rows = {"new": (before, new), "held-out": (held_out, held_out)}
-    errors = {key: {"before": result.errors(a), "after": updated.errors(b)} for key, (a, b) in rows.items() if a and b}
-    figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
-    figures = {name: each for name, each in figures.items() if each["after"]["count"]}  # those with lengths
+    figures, said = _errors(result, updated, held_out)
+    elsewhere += said
     updated = replace(updated, record=_carried_on(result.record, last, source))
     moved = _moved(result, updated, released, changes)
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
     return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
+
+
+def _errors(
+    result: Calibration, updated: Calibration, held_out: Dataset | None
+) -> tuple[dict[str, dict[str, dict[str, float]]], str]:
+    """Return statistics of the new and of held-out rows' errors before and after an update, and how to read them."""
+    new = before = updated.problem.data
+    said = ""
+    if apart := unregistered(result, new, held_out_errors(result, new)):
+        with suppress(InputError):  # few rows
+            before = registered_again(result, new)[0]
+            said = f"{apart.partition(':')[0]}: errors with the previous calibration are after registration."
+    rows = {"new": (before, new), "held-out": (held_out, held_out)}
+    errors = {key: {"before": result.errors(a), "after": updated.errors(b)} for key, (a, b) in rows.items() if a and b}
+    figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
+    return {name: each for name, each in figures.items() if each["after"]["count"]}, said  # those with lengths
 
 
 def _carried_on(record: Record, last: Earlier, source: str) -> Record:
