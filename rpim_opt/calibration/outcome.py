@@ -324,11 +324,11 @@ class Outcome:
 
         Of a recalibration under its own prior, which is the earlier rows: the new ones may determine few frames.
         """
-        form = self.program.penalty_form
-        if not self.record.earlier or form is None:
+        form, p = self.program.penalty_form, self.stated.parameters
+        frames = p.of_frames & p.identified
+        if not self.record.earlier or form is None or not frames.any():
             return fitted_frames(self.stated)
-        p = self.stated.parameters
-        alone = self.stated.identifying(p.of_frames & p.identified)
+        alone = self.stated.identifying(frames)
         free, of = self.problem.parameters.free, alone.parameters.free
         k = [free.names.index(name) for name in of.names]
         return alone, ridge_deviations(alone, prior=(form.matrix[:, k] / free.scale[k] * of.scale, form.c))
