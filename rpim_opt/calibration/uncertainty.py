@@ -21,7 +21,7 @@ from rpim_opt.data.record import CONFIDENCE, HeldOut
 from rpim_opt.robot.parameters import of_session
 from rpim_opt.robot.terms import transmission
 
-APART = 1e4  # variance of an unknown session over a reading's, from which on an interval says nothing
+UNINFORMATIVE = 1e4  # variance of an unknown session over a reading's, from which on an interval says nothing
 RARE = 0.01  # probability that data like those of the calibration have any row that is named
 
 
@@ -238,7 +238,7 @@ def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None =
         freedom = row_freedom(result.freedom, sessions_spread(result.learned), S, session)
         squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)
         predicted = (A[:, :, ~known] == 0).all(axis=(1, 2))
-        predicted &= np.einsum("nkk->n", session - APART * (reading - session)) < 0
+        predicted &= np.einsum("nkk->n", session - UNINFORMATIVE * (reading - session)) < 0
         sigmas[block.row] = np.where(predicted, np.sqrt(squares), np.nan)
         limit = np.sqrt(k * fdtri(k, freedom, 1 - RARE / N))
         allowed[block.row] = np.where(predicted, limit, np.nan)
@@ -250,13 +250,13 @@ def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None =
     return replace(held, coverage=float(covered.mean()) if len(covered) else None)
 
 
-def unregistered(result: Outcome, data: Dataset, held: HeldOut) -> str:
-    """Say of which sessions the registration is unknown and rows have no interval; empty without such."""
+def unregistered(result: Outcome, data: Dataset, held: HeldOut, so: str = "register its rows (--register)") -> str:
+    """Say of which sessions the registration is unknown and rows have no interval, and so what; empty without such."""
     if result.no_intervals or not any(map(of_session, result.problem.parameters.free.names)):
         return ""
     sessions = {*data.session[np.isnan(held.sigmas)]} - {*result.problem.sample().data.session}
     named = listed(sorted(f"'{name}'" for name in sessions))
-    return named and f"Where the instrument stood in session {named} is unknown: register its rows (--register)."
+    return named and f"Where the instrument stood in session {named} is unknown: {so}."
 
 
 def required_coverage(rows: int) -> float:

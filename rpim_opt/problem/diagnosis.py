@@ -588,10 +588,8 @@ def _other_place(points: Points, first: Fit, second: Fit, sessions: bool) -> tup
         far = float(np.linalg.norm(places[:, 1] - places[:, 0], axis=1).mean())
         remedy = "calibrate one part, and add the other to its result with `update --reset 'base_*'`"
         if sessions:  # of one place, unless they are said to be apart
-            remedy = (
-                "if it did between sessions, identify `session_*` in place of `base_*`, with session_mm = 1000 and "
-            )
-            remedy += "session_mrad = 1000 in [scale]"
+            remedy = "if it did between sessions, identify `session_*` in place of `base_*`, "
+            remedy += "with session_mm = 1000 and session_mrad = 1000 in [scale]"
         other, what = "base", f"the instrument or the robot's base moved; {remedy}"
     if reflectors > far:
         far, joint, places = reflectors, len(points.robot.mdh), np.stack([first.tools, second.tools], axis=1)

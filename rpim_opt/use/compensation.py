@@ -336,14 +336,19 @@ def compensate(
     )  # fmt: skip
     if tool is None:
         return found
-    # why the stated tool is less certain than the reflector, at its least certain row
     reflector = _Cell.of(result, robot, arm, kind, None, cell.marker, base, targets.torque is not None)
+    return replace(found, point=point + _less_certain(reflector, found, targets))
+
+
+def _less_certain(reflector: _Cell, found: Compensation, targets: Targets) -> str:
+    """Say why a stated tool is less certain than the reflector, at its least certain row; empty where it is not."""
     row = int(np.argmax(found.std))
     there = Targets._make(None if each is None else each[row : row + 1] for each in targets)
     known, of_tool = reflector.uncertainty(found.q[row : row + 1], there)[0][0], found.std[row]
     if not of_tool > LESS_KNOWN * known:
-        return found
-    last = {f"{name}{arm.dof}" for name in ("d", "theta")} & set(reflector.problem.parameters.free.names)
+        return ""
+    dof = reflector.robot.dof
+    last = {f"{name}{dof}" for name in ("d", "theta")} & set(reflector.problem.parameters.free.names)
     advice = "Measure a reflector as far from the flange as this point."
     if last:
         advice = (
@@ -351,8 +356,7 @@ def compensate(
             "flange (`known` in [prior]), or do not identify these parameters."
         )
     of_tool, known = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known))
-    point += f" In row {found.label[row]}, U is {of_tool} at the tool and {known} at the reflector. {advice}"
-    return replace(found, point=point)
+    return f" In row {found.label[row]}, U is {of_tool} at the tool and {known} at the reflector. {advice}"
 
 
 def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool | None) -> tuple[dict[str, Any], str]:

@@ -17,7 +17,7 @@ from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import noise_covariances
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import APART, held_out_errors, unregistered
+from rpim_opt.calibration.uncertainty import UNINFORMATIVE, held_out_errors, unregistered
 from rpim_opt.calibration.verdict import misread
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
@@ -196,11 +196,11 @@ def monitor(
     data, motion = registered_again(result, data) if register else (data, "")
     problem = recalibration.with_data(result, replace(data, configuration=visits))
     level = recalibration.FALSE_ALARM / TESTS
-    sigmas, deviate, sizes = _innovations(result, problem, own, level / count)
+    sigmas, deviate, equations = _innovations(result, problem, own, level / count)
     held = held_out_errors(result, data)
     return Monitoring(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
-        allowed=np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - level / count)), sums=cusum(deviate),
+        allowed=np.sqrt(equations * fdtri(equations, max(result.freedom, 1.0), 1 - level / count)), sums=cusum(deviate),
         limit=cusum_limit(count, level), drift=_drift(result, problem, own, level), registered=motion,
         mistake=unregistered(result, data, held)
         or misread(result, data)
@@ -248,23 +248,23 @@ def _innovations(
         of_rows = zip(part, np.broadcast_to(V, (len(part), *V.shape[1:])), strict=True)
         rows |= zip(block.row.tolist(), of_rows, strict=True)
     freedom = max(result.freedom, 1.0)
-    sigmas, p_values, sizes = np.zeros(len(rows)), np.full(len(rows), 0.5), np.zeros(len(rows), dtype=int)
+    sigmas, p_values, degrees = np.zeros(len(rows)), np.full(len(rows), 0.5), np.zeros(len(rows), dtype=int)
     for t, (equations, V) in sorted(rows.items()):
         J = np.hstack([equations[:, 1 : slopes.shape[1] + 1], np.kron(own[:, t], equations[:, slopes.shape[1] + 1 :])])
         S = J @ C @ J.T + V
         e = equations[:, 0] - J @ m
         s, U = scipy.linalg.eigh(S, V)
-        told = s < APART
-        sizes[t] = told.sum()
+        told = s < UNINFORMATIVE
+        degrees[t] = told.sum()
         squares = float(np.sum((U.T @ e)[told] ** 2 / s[told]))
         sigmas[t] = np.sqrt(squares)
-        if sizes[t]:
-            p_values[t] = fdtrc(sizes[t], freedom, squares / sizes[t])
+        if degrees[t]:
+            p_values[t] = fdtrc(degrees[t], freedom, squares / degrees[t])
         if p_values[t] >= level:
             gain = np.linalg.solve(S, J @ C).T
             m = m + gain @ e
             C = C - gain @ S @ gain.T
-    return sigmas, -np.asarray(ndtri(np.clip(p_values, SMALLEST, 1 - SMALLEST))), np.maximum(sizes, 1)
+    return sigmas, -np.asarray(ndtri(np.clip(p_values, SMALLEST, 1 - SMALLEST))), np.maximum(degrees, 1)
 
 
 def cusum(deviate: Array) -> Array:

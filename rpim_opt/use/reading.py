@@ -27,6 +27,7 @@ from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.kinematics import FRAME
+from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import reflectors, tool_prefix
 from rpim_opt.store.raw import Understanding, rows_of, understand_of
 from rpim_opt.use.sessions import registered_again
@@ -68,30 +69,8 @@ def read_targets(
     if tool is None:
         tool = [values[tool_prefix(marker if marker in known else known[0]) + axis] for axis in FRAME]
     understanding = _understood(result, source, pose, options or TableOptions(), np.asarray(tool, dtype=float))
-    columns = dict(understanding.columns)
-    stems = {split_unit(name)[0] for name in columns}
-    joints = not stems.isdisjoint(f"q{i}" for i in range(1, robot.dof + 1))
-    oriented = not stems.isdisjoint({"qw", "rx", "r11"})
-    positions = oriented or not stems.isdisjoint("xyz")  # without x, y, z an orientation is refused as half a pose
     with in_file(source):
-        if any(each.doubt == "quaternion" for each in understanding.tables):
-            raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
-        if not joints and not positions:
-            raise InputError("the header", "no targets", "columns q1_deg, ..., or x_mm, y_mm, z_mm, or both")
-        # read as measurements are, with zeros for the half that targets need not have
-        absent = [] if joints else list(joint_columns(robot.joint_dimensions))
-        absent += [] if positions else ["x_mm", "y_mm", "z_mm"]
-        columns |= dict.fromkeys(absent, [0.0] * len(next(iter(columns.values()))))
-        noise = {"position_mm": 1, "orientation_mrad": 1} if oriented else {"position_mm": 1}
-        data = read_data(columns, robot, noise, pose if oriented else position)
-        block, *others = data.blocks
-        if others:
-            raise InputError("column marker", "several reflectors", "targets of one")
-        if block.approach is not None:
-            accepted = "none: joints are in the middle of their backlash"
-            raise InputError("column approach1", "directions of approach", accepted)
-    torque = None if block.torque is None else block.torque[:, 0]
-    targets = Targets(data.label, data.q if joints else None, block.y if positions else None, torque, block.payload)
+        targets = _targets(robot, understanding)
     angles = ("rx", "ry", "rz", "qw,")
     turned = [each for table in understanding.tables for each in table.meant if each.name.startswith(angles)]
     if turned:
@@ -99,6 +78,32 @@ def read_targets(
         notes = (*understanding.notes, f"Orientation of targets: {meant}.")
         understanding = replace(understanding, notes=notes)
     return targets, understanding
+
+
+def _targets(robot: Robot, understanding: Understanding) -> Targets:
+    """Return the targets of a table, read as measurements are, with zeros for the half that targets need not have."""
+    columns = dict(understanding.columns)
+    stems = {split_unit(name)[0] for name in columns}
+    joints = not stems.isdisjoint(f"q{i}" for i in range(1, robot.dof + 1))
+    oriented = not stems.isdisjoint({"qw", "rx", "r11"})
+    positions = oriented or not stems.isdisjoint("xyz")  # without x, y, z an orientation is refused as half a pose
+    if any(each.doubt == "quaternion" for each in understanding.tables):
+        raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
+    if not joints and not positions:
+        raise InputError("the header", "no targets", "columns q1_deg, ..., or x_mm, y_mm, z_mm, or both")
+    absent = [] if joints else list(joint_columns(robot.joint_dimensions))
+    absent += [] if positions else ["x_mm", "y_mm", "z_mm"]
+    columns |= dict.fromkeys(absent, [0.0] * len(next(iter(columns.values()))))
+    noise = {"position_mm": 1, "orientation_mrad": 1} if oriented else {"position_mm": 1}
+    data = read_data(columns, robot, noise, pose if oriented else position)
+    block, *others = data.blocks
+    if others:
+        raise InputError("column marker", "several reflectors", "targets of one")
+    if block.approach is not None:
+        accepted = "none: joints are in the middle of their backlash"
+        raise InputError("column approach1", "directions of approach", accepted)
+    torque = None if block.torque is None else block.torque[:, 0]
+    return Targets(data.label, data.q if joints else None, block.y if positions else None, torque, block.payload)
 
 
 class Measured(NamedTuple):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -293,7 +292,7 @@ def update(
     )  # fmt: skip
     held_out = None if released else result.record.validation  # which was measured before a change
     figures, said = _errors(result, updated, held_out)
-    elsewhere += said
+    elsewhere = " ".join(filter(None, [elsewhere, said]))
     updated = replace(updated, record=_carried_on(result.record, last, source))
     moved = _moved(result, updated, released, changes)
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
@@ -305,11 +304,14 @@ def _errors(
 ) -> tuple[dict[str, dict[str, dict[str, float]]], str]:
     """Return statistics of the new and of held-out rows' errors before and after an update, and how to read them."""
     new = before = updated.problem.data
-    said = ""
-    if apart := unregistered(result, new, held_out_errors(result, new)):
-        with suppress(InputError):  # few rows
+    said = unregistered(
+        result, new, held_out_errors(result, new), "errors with the previous calibration are after registration"
+    )
+    if said:
+        try:
             before = registered_again(result, new)[0]
-            said = f"{apart.partition(':')[0]}: errors with the previous calibration are after registration."
+        except InputError:  # few rows
+            said = ""
     rows = {"new": (before, new), "held-out": (held_out, held_out)}
     errors = {key: {"before": result.errors(a), "after": updated.errors(b)} for key, (a, b) in rows.items() if a and b}
     figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
