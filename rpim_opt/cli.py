@@ -3,8 +3,6 @@
 Annotations are values here: typer reads each of them twice, and as texts they would be compiled as often.
 """
 
-import atexit
-import gc
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -93,11 +91,6 @@ app = typer.Typer(cls=Commands, no_args_is_help=True, help=HELP, **PLAIN)
 # click's, or typer's own copy, depending on typer's version
 USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 INTERRUPTED = 130
-LIBRARY_SETTINGS = {"OPENBLAS_NUM_THREADS": "1", "PYDANTIC_DISABLE_PLUGINS": "__all__"}
-"""Without what libraries do as they are loaded, and no command uses: threads beside ours, a search for plugins."""
-GARBAGE_THRESHOLD = 200_000
-"""Objects after which Python looks for garbage: loading makes half as many, and a calibration leaves a thousand."""
-LONG = ("study", "compare")  # commands that run others' programs, and for long: they and Python are left as they are
 ABORT: Any = (KeyboardInterrupt, typer.Abort)
 
 
@@ -109,14 +102,10 @@ def _version(asked: bool) -> None:
 
 @app.callback()
 def _common(
-    context: typer.Context,
     version: Annotated[bool, Option("--version", help="Print the version.", is_eager=True, callback=_version)] = False,
 ) -> None:
-    """Set Python and libraries up for a command that loads them, runs and ends."""
-    if context.invoked_subcommand not in LONG:
-        for name, value in LIBRARY_SETTINGS.items():
-            os.environ.setdefault(name, value)
-        gc.set_threshold(GARBAGE_THRESHOLD)
+    """Hold linear algebra to one thread unless told otherwise: others would compete with those of a command."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def _completed(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
@@ -788,7 +777,6 @@ def _against(limit: float | None, name: str, value: float) -> tuple[list[str], b
 
 def main() -> None:
     """Run the command line; an error that a user can correct is one sentence, not a traceback."""
-    atexit.register(gc.freeze)  # what ends with the process is not searched for garbage once more
     with console.output_errors():
         try:
             code = app(standalone_mode=False)
