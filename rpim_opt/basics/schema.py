@@ -21,7 +21,7 @@ TYPES = {
     "string_type": "a text in quotes", "list_type": "a list in brackets", "dict_type": "a table",
     "model_type": "a table", "bool_type": "true or false", "int_type": "an integer", "float_type": "a number",
 }  # fmt: skip
-OF_UNION = re.compile(r"(str|float|dict|list|literal)(\[.*])?")  # in pydantic's places one of several types, no key
+OF_UNION = re.compile(r"(str|float|dict|list|literal|[A-Z]\w*Table)(\[.*])?")  # no keys, but types of a union
 
 
 class Misfit(InputError, ValueError):

@@ -32,6 +32,7 @@ from rpim_opt.data.record import Record
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.multi_robot import together
+from rpim_opt.problem.noise import Repeatability
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import starting_parameters
 from rpim_opt.robot.chain import OF_JOINTS
@@ -125,7 +126,8 @@ def load(
         fixtures = problem_file.place_fixtures(definition.placed, rows)
         parameters = starting_parameters(definition.robot, rows, definition.base, tools, fixtures, temperature)
         problem = CalibrationProblem(definition.robot, definition.chosen(parameters, rows), rows)
-        problem = problem.with_repeatability(problem_file.stated_repeatability(table, path))
+        if not isinstance(table.repeatability, str):
+            problem = problem.with_repeatability(Repeatability(**dict(table.repeatability)))
         if validation is not None:
             problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
         formulation = _formulation(definition, problem)

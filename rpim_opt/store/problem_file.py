@@ -29,7 +29,6 @@ from rpim_opt.data.measurements.camera import Board, grid_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.record import CONFIDENCE, Requirement
-from rpim_opt.problem.noise import Repeatability
 from rpim_opt.problem.problem import identifiable
 from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.formats.tables import Mounting, PayloadTable, gravity_with
@@ -42,7 +41,7 @@ from rpim_opt.robot.terms import Term
 from rpim_opt.store.own_code import is_own, own_object
 
 Model = Literal["geometry", "auto"]
-LEARNED_NOISE = ("robot", "free", "level", "declared")
+Noise = Literal["robot", "free", "level", "declared"]
 PACKAGE = Path(__file__).resolve().parents[1]
 MEASURED = "measured"  # The place that every problem has: the configurations of its identification data.
 FIELDS = {  # keys of ``[record]``, and what a report calls them
@@ -277,13 +276,13 @@ class ProblemTable(Table):
     noise_assumed: bool = False  # The measurement noise is a guess, which results and reports state.
     raw: dict[str, str] = Field({})  # Files from which `new` made the tables: name = SHA-256.
     observation: list[Observation] = Field([])  # Several measurement types, a table each.
-    target: str | dict[str, Any] | None = None  # Board of a camera: a table, or columns, rows and spacing.
+    target: GridTable | str | None = None  # Board of a camera: a table, or columns, rows and spacing.
     exclude: dict[str, str] = Field({})  # Rows to leave out: label = reason.
     identify: list[Name] | Literal["auto"]  # Patterns of the parameters to identify, or auto.
     formulation: str = "tikhonov"  # Name of a ready formulation.
     selector: str = "learned"  # learned (prior scales), the name of a selection rule, or a number.
     model: Model = "geometry"  # auto: model extensions by evidence; geometry: none.
-    repeatability: str | dict[str, Any] = "robot"  # Components: robot, free, level, declared; or stated.
+    repeatability: RepeatabilityTable | Noise = "robot"  # Components: robot, free, level, declared; or stated.
     noise: dict[str, Any] = Field({})  # Measurement noise of rows that state none.
     scale: dict[Name, Any] = Field({})  # Prior standard deviations, by kind, pattern or name.
     tolerance: dict[Name, Any] = Field({})  # Largest deviations of the formulation bounded.
@@ -291,7 +290,7 @@ class ProblemTable(Table):
     constraints: Constraints = Constraints()  # Constraints on parameters and positions.
     known_distance: list[DistanceTable] = Field([])  # Known distances between touched points or planes.
     known_angle: list[AngleTable] = Field([])  # Known angles between touched planes.
-    base: dict[str, Any] | Literal["auto"] = Field({})  # Start of the base frame, or auto (registration).
+    base: FrameTable | Literal["auto"] = FrameTable()  # Start of the base frame, or auto (registration).
     tool: dict[str, Any] = Field({})  # Start of the tool frame; of several reflectors by marker.
     published: dict[str, dict[str, float]] = Field({})  # Mean errors [mm] that the source prints.
     reference: dict[str, Figure] = Field({})  # Figures that a run must reproduce: [value, tolerance].
@@ -359,7 +358,7 @@ def read_problem(
     arm = _arm(table, path, model)
     base = None
     if table.base != "auto":
-        base = _frame(table.base, "base", path) if table.base else tuple(arm.base)
+        base = tuple(dict(table.base).values()) if table.base.model_fields_set else tuple(arm.base)
     tools = {"": tuple(arm.tool)}
     if any(split_unit(key)[0] in FRAME for key in table.tool):  # one without a name is the only one
         tools = {"": _frame(table.tool, "tool", path)}
@@ -370,7 +369,7 @@ def read_problem(
         board = read_board(inside(path.parent, table.target, "key target", path))
     elif table.target is not None:
         with at_key("target", path):
-            board = grid_board(**dict(validate(GridTable, table.target, path, "target")))
+            board = grid_board(**dict(table.target))
     file = ProblemFile(path, table, placed, arm.robot, kinds, tools, base, board)
     if not file.observations:
         raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
@@ -425,16 +424,6 @@ def _overlay(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
         tables = isinstance(value, Mapping) and isinstance(base.get(key), Mapping)
         merged[key] = _overlay(base[key], value) if tables and value else value  # an empty table clears
     return merged
-
-
-def stated_repeatability(table: ProblemTable, path: Path) -> Repeatability | None:
-    """Return the stated repeatability, or None."""
-    if isinstance(table.repeatability, str):
-        if table.repeatability not in LEARNED_NOISE:
-            accepted = choices(table.repeatability, LEARNED_NOISE) + ", or a table"
-            raise InputError("key repeatability", f"'{table.repeatability}'", accepted, path)
-        return None
-    return Repeatability(**dict(validate(RepeatabilityTable, table.repeatability, path, "repeatability")))
 
 
 def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:

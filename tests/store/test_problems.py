@@ -321,10 +321,10 @@ def test_repeatability_is_a_word_or_a_table(tmp_path: Path) -> None:
     file.write_text(f'repeatability = "level"\n{text}', encoding="utf-8")
     assert ro.load(folder).noise == "level"
     file.write_text(f'repeatability = "some"\n{text}', encoding="utf-8")
-    with pytest.raises(ro.InputError, match="key repeatability: found 'some', accepted: robot"):
+    with pytest.raises(ro.InputError, match="key repeatability: found 'some', accepted: a table or 'robot'"):
         ro.load(folder)
     file.write_text(f"repeatability = 5\n{text}", encoding="utf-8")
-    with pytest.raises(ro.InputError, match="key repeatability: found 5, accepted: a text in quotes or a table"):
+    with pytest.raises(ro.InputError, match="key repeatability: found 5, accepted: a table or 'robot'"):
         ro.load(folder)
     file.write_text(f"{text}\n[repeatability]\nposition_mm = 0.04\njoint_mrad = 0.02\n", encoding="utf-8")
     instance = ro.load(folder)
