@@ -11,7 +11,6 @@ from math import radians
 from pathlib import Path
 from shutil import get_terminal_size
 from textwrap import TextWrapper
-from threading import Timer
 from typing import TYPE_CHECKING, Any, TextIO
 
 from rpim_opt.basics.exceptions import InputError
@@ -68,7 +67,7 @@ def _close(stream: TextIO) -> None:
 
 @contextmanager
 def progress() -> Iterator[Callable[[str], None]]:
-    """Show the current step after one second, on an interactive terminal only."""
+    """Show the current step, on an interactive terminal only."""
     from rich.console import Console
     from rich.live import Live
     from rich.spinner import Spinner
@@ -76,16 +75,8 @@ def progress() -> Iterator[Callable[[str], None]]:
     console = Console(stderr=True)
     step = Spinner("dots", "starting", style="status.spinner")
     # what is printed meanwhile into a file or a pipe is not for the terminal
-    live = Live(step, console=console, transient=True, refresh_per_second=12.5, redirect_stdout=sys.stdout.isatty())
-    timer = Timer(1.0, live.start)
-    timer.daemon = True
-    if console.is_terminal:
-        timer.start()
-    try:
+    with Live(step, console=console, transient=True, refresh_per_second=12.5, redirect_stdout=sys.stdout.isatty()):
         yield lambda text: step.update(text=text)
-    finally:
-        timer.cancel()
-        live.stop()
 
 
 def written_to(path: Path | None, text: str) -> list[Path]:

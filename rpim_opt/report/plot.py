@@ -27,7 +27,7 @@ from rpim_opt.data.dataset import Dataset
 if TYPE_CHECKING:
     from rpim_opt.use.monitoring import Monitoring
 
-__all__ = ["error_vectors", "errors", "l_curve", "parameters"]
+__all__ = ["errors", "l_curve", "parameters"]
 
 Axes = Any  # matplotlib's, imported where axes are made
 COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e"}
@@ -39,7 +39,6 @@ MANY_DOTS = 1000  # Dots beyond which they are one picture in a vector graphic.
 FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 6.0
 """Largest sizes of names along x and y, relative to the axis's label, and the smallest that can be read [points]."""
 LINE_HEIGHT = 1.25  # distance of names over their size
-MODELS = {"before": "nominal", "after": "identified"}  # model that errors before and after calibration are of
 MANY_ROWS = 100  # above it each row is a small point without a name
 TIMES = ((86400.0, "days"), (3600.0, "hours"), (1.0, "seconds"))  # units of an axis of time [s]
 CELLS, FAINT = 24, "#dce8f5"  # of a map: cells along the longer side, and the colour of the least value
@@ -71,8 +70,8 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     few = len(labels) <= MANY_ROWS
     if few:
         ax.vlines(place, before, after, color=COLORS["before"])
-    for when, each in {"before": before, "after": after}.items():
-        _dots(ax, place, each, when, MODELS[when], ms=5.0 if few else 2.0)
+    for when, model, each in (("before", "nominal", before), ("after", "identified", after)):
+        _dots(ax, place, each, when, model, ms=5.0 if few else 2.0)
     flagged = {flag.label for flag in result.flagged} if data is result.problem.data else set()
     at = [i for i, label in enumerate(labels) if label in flagged]
     if at:
@@ -84,35 +83,6 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
         _name(ax, "x", labels)
     logarithmic(ax, "y")
     return _with_legend(ax)
-
-
-def error_vectors(result: Calibration, data: Dataset | None = None, nominal: bool = False, ax: Axes = None) -> Axes:
-    """Draw measured positions [m] with their error vectors, of the identified or of the nominal model, in 3D.
-
-    They are enlarged by 1, 2 or 5 times 10^k, the longest to at most a sixth of the positions' extent; the title says
-    by how much. Arguments as for `errors`.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-    >>> ro.plot.error_vectors(result, nominal=True).get_title()
-    'nominal errors, enlarged 100 times'
-    """
-    ax = _axes(ax, projection="3d")
-    points = result.measured_positions(data)
-    vectors = result.error_vectors(data, nominal=nominal)
-    finite = np.isfinite(vectors).all(axis=1)
-    points, vectors = points[finite], vectors[finite]
-    longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
-    exponent = np.log10(max(float(np.ptp(points, axis=0).max()), 1e-3) / 6 / max(longest, 1e-12))
-    decade = 10.0 ** np.floor(exponent)
-    times = float(max(step for step in (1, 2, 5) if step * decade <= 10**exponent) * decade)
-    when = "before" if nominal else "after"
-    ax.scatter(*points.T, s=6, color="0.3")
-    width = 0.5 if len(points) > MANY_ROWS else 1.5
-    ax.quiver(*points.T, *(times * vectors).T, color=COLORS[when], lw=width, arrow_length_ratio=0.2)
-    ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", aspect="equal")
-    ax.set_title(f"{MODELS[when]} errors, enlarged {times:,.0f} times", fontsize=9)
-    return ax
 
 
 def parameters(result: Calibration, dimension: str = "length", confidence: float = 0.95, ax: Axes = None) -> Axes:
@@ -274,13 +244,13 @@ def checks(found: Monitoring, ax: Axes, sums: bool = False) -> None:
     _with_legend(ax)
 
 
-def _axes(ax: Axes, rows: int = 0, **kwargs: Any) -> Axes:
+def _axes(ax: Axes, rows: int = 0) -> Axes:
     """Return the axes, or new ones that are as high as names of rows need."""
     if ax is not None:
         return ax
     from matplotlib import pyplot
 
-    figure, ax = pyplot.subplots(layout="constrained", subplot_kw=kwargs)
+    figure, ax = pyplot.subplots(layout="constrained")
     figure.set_figheight(max(figure.get_figheight(), 0.2 * rows + 1.2))
     return ax
 

@@ -42,31 +42,22 @@ from rpim_opt.use.sessions import in_session, session_notes
 from rpim_opt.use.validation import Validation
 
 MOST_FLAGGED = 200  # flagged rows that are named, the worst first
-FEW_NUMBERS = 8  # longer arguments of a penalty or constraint are said by their length: an earlier result is a matrix
+LONGEST = 60  # characters of an argument of a penalty or constraint that is shown: an earlier result is a matrix
 WHY = {"learned": "maximum of the marginal likelihood"}  # reasons of choices that have no note; others were given
 L_CURVE_HEIGHT = 430.0
 
 
-def write_report(
-    calibration: Calibration,
-    path: str | Path,
-    validation: Dataset | None = None,
-    new: Mapping[str, Validation] | None = None,
-) -> None:
+def write_report(calibration: Calibration, path: str | Path, new: Mapping[str, Validation] | None = None) -> None:
     """Write a calibration report: one HTML file that needs no network, written whole or not at all.
 
-    Verdict and headline come first, then `SECTIONS`. Every text of a user's file is shown as text. ``validation`` are
-    measurements that were not used for identification, by default those of the calibration's record; ``new`` are
-    `ro.use.validate`'s results of further ones, by the names of their tables: headline and acceptance test are by them.
-    InputError where they do not belong to the problem, or none is of a length.
+    Verdict and headline come first, then `SECTIONS`. Every text of a user's file is shown as text. ``new`` are
+    `ro.use.validate`'s results of further measurements, by the names of their tables: headline and acceptance test are
+    by them. InputError where none is of a length.
 
     >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
-    >>> ro.report.write_report(result, "report.html", ro.load("paper_arm").validation)
+    >>> ro.report.write_report(ro.calibrate("paper_arm"), "report.html")
     """
-    record = calibration.record.dated()
-    record = record if validation is None else replace(record, validation=validation)
-    write_text(Path(path), page(replace(calibration, record=record), new))
+    write_text(Path(path), page(replace(calibration, record=calibration.record.dated()), new))
 
 
 FAVOURABLE = ("accepted", "inconclusive", "rejected")  # verdicts of acceptance tests, the most favourable first
@@ -454,11 +445,8 @@ def _provenance(content: Content) -> Iterator[Block]:
 def _formulation(result: Calibration) -> str:
     """Return what is minimized, in the terms of the result's file."""
 
-    def long(value: Any) -> bool:
-        return isinstance(value, list | tuple) and (len(value) > FEW_NUMBERS or any(map(long, value)))
-
     def argument(value: Any) -> str:
-        return f"{len(value)} rows" if long(value) else str(value)
+        return str(value) if len(str(value)) <= LONGEST else f"{len(value)} rows"
 
     def term(part: Any) -> str:
         if isinstance(part, list):

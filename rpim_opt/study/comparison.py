@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -27,7 +27,6 @@ from rpim_opt.study.methods import METRICS, UNDELIVERED, methods_of, metrics_of,
 USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")  # metrics of a comparison that states none
 MOST_DRAWS = 100_000  # each is a calibration of its own, and is listed before the first begins
 LARGEST = float(np.finfo(float).max)  # whole numbers may be larger than any double
-PEAKED = 3.0  # RMS over mean error above which few rows make it; 1.09 of normal errors
 TIE = 0.01  # errors that differ by no more than this part are a tie
 ENOUGH = 5  # problems from which on an interval speaks of problems like them; with fewer, of these
 BOOTSTRAP_DRAWS = 4000
@@ -283,14 +282,8 @@ class Comparison:
 
     def __str__(self) -> str:
         """Return that line, and the summary where there is one."""
-        return f"{self!r}\n\n{self.summary()}" if self._has_figures else repr(self)
-
-    def _repr_html_(self) -> str | None:
-        return f"<p><b>{self!r}</b></p>{self.summary()._repr_html_()}" if self._has_figures else None
-
-    @property
-    def _has_figures(self) -> bool:
-        return any(figures(self.rows, self.metric).values())
+        has_figures = any(figures(self.rows, self.metric).values())
+        return f"{self!r}\n\n{self.summary()}" if has_figures else repr(self)
 
 
 # --- the ranking of methods ------------------------------------------------------------------------------------------
@@ -345,10 +338,6 @@ class Summary:
     reference: str
     standings: tuple[Standing, ...]
     notes: tuple[str, ...]
-
-    def to_frame(self) -> Any:
-        """Return the standings as a data frame (pandas, or polars where that is missing)."""
-        return frame_of([asdict(each) for each in self.standings])
 
     @property
     def header(self) -> tuple[str, ...]:
@@ -433,20 +422,6 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
     return middle, float(np.exp(low)), float(np.exp(high))
 
 
-def _peaked(rows: Rows) -> Iterator[str]:
-    """Say on which problems few held-out rows make every method's RMS error."""
-    peaks: dict[Pair, list[float]] = {}
-    for row in rows:
-        if row.get("rms_mm") and row.get("mean_mm"):
-            peaks.setdefault(tuple(row[name] for name in SAME_DATA), []).append(row["rms_mm"] / row["mean_mm"])
-    peaked = list(dict.fromkeys(pair[0] for pair, each in peaks.items() if min(each) > PEAKED))
-    if peaked:
-        yield (
-            f"On {listed(peaked, 4)} the RMS error is above {PEAKED:g} times the mean with every method: few held-out "
-            "rows make it. Leave out those that are outliers, or compare by mean_mm."
-        )
-
-
 def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> Iterator[str]:
     """Yield the notes below the table: of what the ratios and intervals speak, and what has no results."""
     yield f"Ratios compare the same replicates in pairs; geometric mean over problems; a tie is within {TIE:.0%}."
@@ -466,7 +441,6 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         yield text
     elif len(standings) > 1:
         yield f"There are no intervals: fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one."
-    yield from _peaked(rows)
     every = Counter(row["method"] for row in rows)
     without: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:

@@ -112,13 +112,9 @@ def test_names_of_many_parameters_do_not_overlap(fitted) -> None:
 
 def test_axes_are_made_and_carry_units(fitted) -> None:
     _, result = fitted
-    axes = [
-        ro.plot.errors(result), ro.plot.parameters(result),
-        ro.plot.parameters(result, "angle"), ro.plot.error_vectors(result),
-    ]  # fmt: skip
+    axes = [ro.plot.errors(result), ro.plot.parameters(result), ro.plot.parameters(result, "angle")]
     said = [ax.get_xlabel() + ax.get_ylabel() for ax in axes]
     assert all("[" in text for text in said)
-    assert "enlarged" in axes[-1].get_title()
     for ax in axes:
         plt.close(ax.figure)
 

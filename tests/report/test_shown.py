@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from xml.etree import ElementTree
 
 import cvxpy as cp
@@ -128,14 +127,6 @@ def test_a_plot_of_a_result_marks_its_weight() -> None:
 
 
 def test_what_is_piped_while_a_command_works_stays_out_of_its_progress(monkeypatch, capsys) -> None:
-    class AtOnce:
-        def __init__(self, _: float, start: Callable[[], None]):
-            self.start = start
-
-        def cancel(self) -> None:
-            pass
-
-    monkeypatch.setattr(console, "Timer", AtOnce)
     monkeypatch.setenv("FORCE_COLOR", "1")  # a terminal on stderr, and none on stdout
     with console.progress() as say:
         say("working")

@@ -37,7 +37,6 @@ def test_without_intervals_none_is_said() -> None:
 def test_what_has_no_figures_is_named_and_nothing_is_summed_up() -> None:
     broken = compared({"a": {"p": None}})
     assert str(broken) == repr(broken) == "Comparison: 1 method on 1 problem, 1 replicates (1 failed)"
-    assert broken._repr_html_() is None
     some = compared({"a": {"p": 1.0}, "b": {"p": None}})
     assert str(some).startswith(f"{some!r}\n\n")
     for against, said in (("c", "against: found 'c'"), ("b", "'b', which has no results")):
