@@ -13,7 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import display
 from rpim_opt.convex.constraints import FAR, Ready, matching
-from rpim_opt.convex.expressions import SQUARES, cp, named
+from rpim_opt.convex.expressions import SQUARES, cp, named, norms
 from rpim_opt.convex.formulation import NAMED, Formulation
 from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.problem.linear import reduced_rows
@@ -126,7 +126,8 @@ def _penalized(
         elif penalty == SQUARES:  # of norms: the sum of all squares, and no cone
             terms.append(cp.sum_squares(np.vstack([np.array(D) for D in groups]) @ y))
         else:
-            terms.append(penalty(cp.hstack([cp.norm(np.array(D) @ y) for D in groups])))
+            which = np.repeat(np.arange(len(groups)), [len(D) for D in groups])
+            terms.append(penalty(norms(np.vstack([np.array(D) for D in groups]) @ y, which)))
     if rows:
         terms.append(cp.sum_squares(np.array(rows) @ z - np.array(values)))
     return sum(terms[1:], terms[0])

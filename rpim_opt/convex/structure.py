@@ -86,7 +86,8 @@ class Expressions:
                     accepted = f"matrices of shape (k, {n}): a column for each identified parameter"
                     raise InputError("penalty_over", f"a matrix of shape {D.shape}", accepted)
             penalized = cp.Variable(len(self.differences))
-            instead = {id(penalized): cp.hstack([cp.norm(D @ z) for D in self.differences])}
+            which = np.repeat(np.arange(len(self.differences)), [len(D) for D in self.differences])
+            instead = {id(penalized): norms(np.vstack(self.differences) @ z, which)}
         frozen = Frozen([z, r, seen, penalized], where)
         live_loss = scalar(called(formulation.loss, f"{where}, loss", seen), f"{where}, loss")
         self.loss = Term(frozen(live_loss), seen)

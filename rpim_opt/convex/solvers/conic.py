@@ -15,7 +15,7 @@ from scipy.linalg import get_lapack_funcs, qr
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.constraints import box_sides
-from rpim_opt.convex.expressions import cp, norms, substituted
+from rpim_opt.convex.expressions import cp
 from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.problem.linear import RANK_TOLERANCE
 
@@ -94,10 +94,9 @@ class Canonical:
         for v in present.values():  # atoms ask for the value of what they are made of, and may get a stale one
             v.save_value(None)
         anchor = [] if variable.id in present else [variable == cp.Variable(variable.shape)]
-        objective, cones = _in_one_cone(objective)
         copies = [cp.Variable(each.size) for each in shared]  # of a variable with attributes there is no column
         same = [copied == cp.vec(each, order="F") for copied, each in zip(copies, shared, strict=True)]
-        problem = cp.Problem(cp.Minimize(objective), [*constraints, *anchor, *cones, *same])
+        problem = cp.Problem(cp.Minimize(objective), [*constraints, *anchor, *same])
         self._chain: Any
         data, self._chain, self._inverse = problem.get_problem_data(cp.CLARABEL, solver_opts={})
         self.size = len(data["c"])
@@ -189,14 +188,17 @@ class Canonical:
     def changes(self, near: Array, M: Array, size: float) -> Canonical:
         """Return the form of changes y of a point (N,), x[at] = near[at] + size M y[at], M (n, n), others size y.
 
-        Its rows are divided by ``size``. The entries of A and P are at the same places whatever M is.
+        Its rows are divided by ``size``.
         """
+        from scipy import sparse
+
+        turned = np.eye(self.size)
+        turned[np.ix_(self.at, self.at)] = M
+        T: Any = sparse.csr_array(turned)
         changed = copy(self)
-        changed.A, changed.b = _times(self.A, self.at, M), (self.b - self.A @ near) / size
-        changed.P = size**2 * _times(_times(self.P, self.at, M).T, self.at, M)
-        slope = size * (self.q + self.P @ near)
-        changed.q = slope.copy()
-        changed.q[self.at] = M.T @ slope[self.at]
+        changed.A, changed.b = sparse.csr_array(self.A) @ T, (self.b - self.A @ near) / size
+        changed.P = size**2 * (T.T @ sparse.csr_array(self.P) @ T)
+        changed.q = size * (T.T @ (self.q + self.P @ near))
         return changed
 
     def missed(self, x: Array) -> float:
@@ -214,35 +216,6 @@ class Canonical:
         raw = SimpleNamespace(status="Solved", solve_time=0.0, iterations=0, obj_val=0.0)
         raw.x, raw.z = x * self.column_scale, z * self.row_scale
         return self._chain.invert(raw, self._inverse).dual_vars
-
-
-def _in_one_cone(objective: Any) -> tuple[Any, list[Any]]:
-    """Return an objective with variables for the norms that it sums, and one constraint for their cones.
-
-    CVXPY takes a millisecond for each norm otherwise, half of a calibration's canonicalization.
-    """
-    found = _norms_in(objective)
-    if len(found) < 2 or _count(objective, {id(norm) for norm in found}) > len(found):
-        return objective, []  # other terms have the norms, too, and may ask for their sign
-    parts = [cp.vec(norm.args[0], order="C") for norm in found]
-    bounds = cp.Variable(len(found))
-    every = norms(cp.hstack(parts), np.repeat(np.arange(len(found)), [part.size for part in parts]))
-    objective = substituted(objective, {id(norm): bounds[i] for i, norm in enumerate(found)})
-    return objective, [cp.SOC(bounds, every.args[0], axis=1)]
-
-
-def _count(e: Any, which: set[int]) -> int:
-    """Return how often an expression has one of some parts, by their ``id``."""
-    return (id(e) in which) + sum(_count(arg, which) for arg in e.args)
-
-
-def _norms_in(e: Any) -> list[Any]:
-    """Return the 2-norms of affine vectors that an expression is affine in."""
-    from cvxpy.atoms.affine.affine_atom import AffAtom
-
-    if type(e).__name__.startswith("Pnorm") and e.p == 2 and e.axis is None and e.args[0].is_affine():
-        return [e]
-    return [norm for arg in e.args for norm in _norms_in(arg)] if isinstance(e, AffAtom) else []
 
 
 def _scales(A: Any, m: int, n: int, at: np.ndarray, linear: int, cones: list[int]) -> tuple[Array, Array]:
@@ -373,7 +346,7 @@ class ReducedSquares:
 class Point:
     """A minimum x (N,) of the canonical form, multipliers of its rows (m,), and the unknowns of the exact loss.
 
-    Of Clarabel's minima also the slacks of the rows (m,), and the objective but for constants.
+    Of Clarabel's minima also the slacks of the rows (m,).
     """
 
     x: Array
@@ -381,7 +354,6 @@ class Point:
     iterations: int = 0
     rest: Array | None = None
     slack: Array = field(default_factory=lambda: np.zeros(0))
-    cost: float = np.inf
 
 
 class ReducedProgram:
@@ -397,8 +369,6 @@ class ReducedProgram:
         self.canonical, self.rows, self.loss, self.counts = canonical, rows, loss, counts
         self.working = np.zeros(0, dtype=int)
         self.near = np.zeros(canonical.size)
-        self.far = -1.0  # the weight of the last minimum, if that was far from where it was sought
-        self._changed: ReducedProgram | None = None  # the program of changes, set up once
 
     def solve(self, squares: ReducedSquares, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
@@ -469,78 +439,42 @@ class ReducedProgram:
         if self.rows and not near.any():
             rows = np.vstack([squares.R, np.sqrt(weight + CENTRED * np.sum(squares.R**2)) * np.eye(n)])
             near[p.at] = np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0]
-        found = self._nearby(near, squares, weight, A, b) if self._walks(weight) else None
-        if found is None:
-            found = self._about(near, squares, weight, A, b)
-            if (p.missed(found.x) > ACCEPTED or np.abs(found.x - near).max() > FAR) and not len(p.shared):
-                found = self._nearby(found.x, squares, weight, A, b, found) or found
-        self.far = weight if np.abs(found.x - near).max() > FAR and not len(p.shared) else -1.0
+        found = self._about(near, squares, weight, A, b)
+        if (p.missed(found.x) > ACCEPTED or np.abs(found.x).max() > FAR) and not len(p.shared):
+            missed, there = max(FEASIBLE, p.missed(found.x)), found.x
+            for _ in range(REFINEMENTS):
+                try:
+                    refined = self._refined(there, squares, weight, A, b)
+                except Unsolved:
+                    break
+                there = refined.x
+                if p.missed(there) <= max(missed, SOUGHT * np.abs(there).max()):
+                    found = refined
+                    break
         self.near = found.x
         return found
 
-    def _walks(self, weight: float) -> bool:
-        """Return whether the minimum at a weight is as far away as the last one was, along what hardly costs."""
-        return weight <= FAR * self.far
-
-    def _nearby(
-        self,
-        near: Array,
-        squares: ReducedSquares,
-        weight: float,
-        A: Array | None,
-        b: Array | None,
-        found: Point | None = None,
-    ) -> Point | None:
-        """Return the minimum refined from a point (N,), or None where it misses constraints by more than ``found``.
-
-        Where none is solved, one in changes of half the size may be. It replaces ``found`` only if it lowers the
-        objective without missing constraints more.
-        """
-        missed = max(FEASIBLE, 0.0 if found is None else self.canonical.missed(found.x))
-        there, size, again = near, np.abs(near).max(), False
-        for _ in range(REFINEMENTS):
-            try:
-                point = self._refined(there, size, squares, weight, A, b)
-            except Unsolved:
-                if found is None:
-                    return None
-                size, again = size / 2, True
-                continue
-            there, size = point.x, np.abs(point.x).max()
-            if self.canonical.missed(there) <= max(missed, 0.0 if again else SOUGHT * size):
-                lower = found is None or point.cost < found.cost
-                return point if lower or not again else None
-        return None
-
-    def _refined(
-        self, near: Array, far: float, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
-    ) -> Point:
+    def _refined(self, near: Array, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None) -> Point:
         """Return the minimum next to one (N,), in changes of unit size: z = z0 + V min(1 / s, far) y, others far y.
 
-        s and V are the singular values and directions of all equations. With small weights some directions of z are
-        10^5 scales long and others 10^-4, and costs are below a solver's tolerances.
+        s and V are the singular values and directions of all equations, far is the size of the point. With small
+        weights some directions of z are 10^5 scales long and others 10^-4, and costs are below a solver's tolerances.
         """
         p = self.canonical
-        z0, every = near[p.at], squares.R
+        z0, every, far = near[p.at], squares.R, np.abs(near).max()
         if A is not None:
             every = np.vstack([every, A])
         _, s, V = np.linalg.svd(np.linalg.qr(every, mode="r"))
         M = V.T / np.maximum(np.pad(s, (0, len(z0) - len(s))), 1 / far)
-        changed = p.changes(near, M / far, far)
-        self._changed = program = self._changed or ReducedProgram(changed, self.rows, self.loss, self.counts)
-        program.canonical = changed
-        program.data.renumber(changed)
-        attempts = ATTEMPTS[1:] if self._walks(weight) else ATTEMPTS  # the first one hardly ever reaches far
-        program.data.clarabel.attempts = [(*REFINED, *other) for other in attempts]
-        constant = weight * (p.value(near) - p.offset) + squares.g @ z0
+        program = ReducedProgram(p.changes(near, M / far, far), self.rows, self.loss, self.counts)
+        program.data.clarabel.attempts = [(*REFINED, *other) for other in ATTEMPTS]
         squares = ReducedSquares(squares.R @ M, squares.y - squares.R @ z0, M.T @ squares.g)
         if A is not None and b is not None:
             A, b = A @ M, b - A @ z0
         point = program._about(np.zeros(p.size), squares, weight, A, b)
         x = far * point.x
         x[p.at] = M @ point.x[p.at]
-        cost = constant + point.cost
-        return replace(point, x=near + x, dual=point.dual / far, slack=far * point.slack, cost=cost)
+        return replace(point, x=near + x, dual=point.dual / far, slack=far * point.slack)
 
     def _about(self, near: Array, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None) -> Point:
         """Return Clarabel's minimum; the unknowns are changes of ``near`` (N,)."""
@@ -564,8 +498,7 @@ class ReducedProgram:
         x, z, s = np.array(solution.x), np.array(solution.z) / scale, np.array(solution.s)
         x[: p.size] += near
         own = slice(k, k + len(p.b))
-        value = solution.obj_val / scale + weight * (p.value(near) - p.offset) + squares.g @ z0
-        return Point(x[: p.size], z[own], int(solution.iterations), x[p.size + k :], s[own], value)
+        return Point(x[: p.size], z[own], int(solution.iterations), x[p.size + k :], s[own])
 
 
 class _ConicData:
@@ -617,11 +550,6 @@ class _ConicData:
         # a loss's rows come as the user scaled them
         self.clarabel = Clarabel(cones, ATTEMPTS if loss is None else (EQUILIBRATED, *ATTEMPTS))
 
-    def renumber(self, p: Canonical) -> None:
-        """Take the numbers of another penalty and constraints with the same entries."""
-        self.own = _entries(p.A, 0, 0)[2]
-        self._curvature[self._weighted] = _entries(p.P, 0, 0, upper=True)[2]
-
     def linked(self, r: Array) -> Array:
         """Return the bounds of the loss's rows, for a residual r (m,) of the equations."""
         bounds = self._bounds.copy()
@@ -640,21 +568,6 @@ class _ConicData:
         self.P.data = self._curvature.copy()
         self.P.data[self._weighted] *= weight
         return self.P, self.matrix
-
-
-def _times(A: Any, at: np.ndarray, M: Array) -> Any:
-    """Return a sparse matrix with its columns ``at`` times M, and the zeros that this makes."""
-    from scipy import sparse
-
-    A = sparse.coo_array(A)
-    place = np.full(A.shape[1], -1)
-    place[at] = np.arange(len(at))
-    own = place[A.col] >= 0
-    rows, row = np.unique(A.row[own], return_inverse=True)
-    block: Any = sparse.csr_array((A.data[own], (row, place[A.col[own]])), (len(rows), len(at)))
-    there, columns, _ = _block(rows, at)
-    numbers = np.concatenate([(block @ M).ravel(), A.data[~own]])
-    return sparse.coo_array((numbers, (np.append(there, A.row[~own]), np.append(columns, A.col[~own]))), A.shape)
 
 
 Entries = tuple[np.ndarray, np.ndarray, Array]
