@@ -61,7 +61,7 @@ def environment(tools: bool = True, folder: Path = ENVIRONMENT, locked: Path = R
 
 def command_line(*arguments: str) -> int:
     """Run rpim-opt from this checkout, which needs no build, in the caller's folder."""
-    program = "from rpim_opt.cli import main; main()"
+    program = "from rpim_opt.__main__ import main; main()"
     code = f"import sys; sys.path.insert(0, {str(ROOT)!r}); sys.argv[0] = 'rpim-opt'; {program}"
     return run("python", "-c", code, *arguments)
 

@@ -91,7 +91,6 @@ app = typer.Typer(cls=Commands, no_args_is_help=True, help=HELP, **PLAIN)
 # click's, or typer's own copy, depending on typer's version
 USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 INTERRUPTED = 130
-ABORT: Any = (KeyboardInterrupt, typer.Abort)
 
 
 def _version(asked: bool) -> None:
@@ -780,7 +779,7 @@ def main() -> None:
     with console.output_errors():
         try:
             code = app(standalone_mode=False)
-            if code == INTERRUPTED:  # typer's own answer to Ctrl-C in some versions, without a word
+            if code == INTERRUPTED:  # typer's own answer to Ctrl-C, without a word
                 console.fail("Interrupted.", INTERRUPTED)
             sys.exit(code)
         except USAGE as error:
@@ -788,8 +787,6 @@ def main() -> None:
                 error.show()
                 sys.exit(error.exit_code)
             console.fail(error.format_message(), error.exit_code)
-        except ABORT:
-            console.fail("Interrupted.", INTERRUPTED)
         except RpimError as error:
             text = error.command if isinstance(error, InputError) else str(error)
             console.fail(text, next((code for kind, code in FAILURES.items() if isinstance(error, kind)), 2))

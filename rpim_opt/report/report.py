@@ -372,24 +372,20 @@ def _diagnostics(content: Content) -> Iterator[Block]:
 def _identifiability(result: Calibration) -> Iterator[Block]:
     parameters = result.problem.parameters
     observability = observe(result.problem.identifying(parameters.identified & ~parameters.of_curves))
-    text = f"{observability.configurations} configurations. {summary.identifiability(result)}"
-    redundant = [f"{combination(each)}" for each in observability.redundant]
+    redundant = observability.redundant
+    lines = [f"{observability.configurations} configurations. {summary.identifiability(result)}"]
     if result.record.earlier:
-        text += " The other parameters are known from the earlier calibrations that serve as prior."
-        redundant = []
-    elif observability.rank < len(observability.names):
-        if observability.unidentifiable:
-            text += f" Unidentifiable (no measurement depends on them): {', '.join(observability.unidentifiable)}."
-        text += (
-            " Redundant combinations [mm, mrad], which change no measurement at the nominal parameters; the "
+        lines.append("The other parameters are known from the earlier calibrations that serve as prior.")
+        redundant = ()
+    elif redundant:
+        lines.append(
+            "Redundant combinations [mm, mrad], which change no measurement at the nominal parameters; the "
             "penalty determines them. Predictions of another point on the flange or of its orientation may depend on "
             "them."
         )
-    yield "text", [text]
-    yield "bullets", redundant
-    indices = ", ".join(f"{name} {value:.3g}" for name, value in observability.indices.items())
-    source = "observability indices (Sun and Hollerbach 2008)"
-    yield "text", [f"Condition number {observability.condition:.3g}; {source}: {indices}."]
+    yield "text", lines
+    yield "bullets", list(map(combination, redundant))
+    yield "text", str(replace(observability, redundant=())).splitlines()[1:]
 
 
 def _provenance(content: Content) -> Iterator[Block]:

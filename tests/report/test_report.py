@@ -99,7 +99,7 @@ def test_the_report_says_the_figures_of_the_result(arm, arm_page) -> None:
         "On 16 validation measurements, not used for identification, "
         "the mean position error falls from 2.649 mm to 0.032 mm" in text
     )
-    assert "Unidentifiable (no measurement depends on them): theta6." in text
+    assert "Unidentifiable: theta6." in text
     assert "T8-6" in text  # left out, with its reason
     assert "0.03 mm (x, y, z)" in text
     assert re.search(r"Held-out rows: \d+ % of the coordinates are within", text)
