@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import csv
 import io
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -16,7 +17,6 @@ from markupsafe import Markup
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import write_text
 from rpim_opt.report import plot
-from rpim_opt.report.summary import mm
 from rpim_opt.use.monitoring import Monitoring
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
@@ -87,6 +87,10 @@ def render(
     )  # fmt: skip
 
 
+COLUMNS = {"label": "check", "error_mm": "error [mm]", "sigmas": "standard deviations", "allowed_sigmas": "allowed"}
+"""What the page of checks calls columns of their table."""
+
+
 def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     """Write checks over time, as `use.monitor` returns them: as HTML page that works offline, or as table (``.csv``).
 
@@ -104,18 +108,8 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
         write_text(path, found.csv())
         return
     verdict, *details = str(found).splitlines()
-    sigmas = [f"{value:.1f}" for value in found.sigmas]
-    for i in found.beyond:
-        sigmas[i] = f"above {sigmas[i]}"
-    sums = [f"{value:.1f}" for value in found.sums]
-    if found.alarm is not None:
-        sums[found.alarm] = f"alarm {sums[found.alarm]}"
-    columns: dict[str, Sequence[str]] = {"check": found.label}
-    if found.times:
-        columns["time"] = found.times
-    columns["error [mm]"] = [mm(1e3 * error) for error in found.error]
-    columns |= {"standard deviations": sigmas, "cumulative sum": sums}
-    table = Table("In chronological order", list(columns), list(zip(*columns.values(), strict=True)))
+    header, *rows = csv.reader(found.csv().splitlines())
+    table = Table("In chronological order", [COLUMNS.get(name, name) for name in header], rows)
     charts = [figure(partial(plot.checks, found), "Residual of every check and its limit", "Individual checks.")]
     title_of_sum = "Cumulative sum of the checks and its limit"
     charts.append(figure(partial(plot.checks, found, sums=True), title_of_sum, "Cumulative sum of the checks (CUSUM)."))
