@@ -32,7 +32,7 @@ ENOUGH = 5  # problems from which on an interval speaks of problems like them; w
 BOOTSTRAP_DRAWS = 4000
 CONFIDENCE = 0.95
 ROW_INCHES = 0.25  # height of a method in a figure
-LARGEST_RATIO = 30.0  # ratios beyond are drawn at the edge, with an arrow
+LARGEST_RATIO = 30.0  # ratios beyond are drawn at the edge
 SAME_DATA = ("problem", "split", "fold", "count", "noise_factor", "seed")
 """Columns in which two replicates of a pair agree: then they saw the same data."""
 Pair = tuple[Any, ...]
@@ -489,9 +489,6 @@ def _ratios(summary: Summary, of: Mapping[str, Mapping[Pair, float]]) -> Any:
         values = [own / other[pair] for pair, own in of[each.method].items() if other.get(pair)]
         alpha = min(0.5, 3 / max(len(values), 1) ** 0.5)
         ax.plot(_inside(values), np.full(len(values), y), "o", ms=3.5, color="C0", alpha=alpha, mew=0, zorder=2)
-        for edge, marker in ((LARGEST_RATIO, ">"), (1 / LARGEST_RATIO, "<")):
-            if any((value - edge) * (edge - 1) > 0 for value in values):
-                ax.plot([edge], [y], marker, ms=6, color="C0", zorder=2)
         colour = "0.3"
         if each.low is not None and each.high is not None:
             if each.different:

@@ -19,7 +19,6 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors
 from rpim_opt.calibration.verdict import judge
 from rpim_opt.convex.formulation import FORMULATIONS, formulation_of, tikhonov
-from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import require_weight
 from rpim_opt.convex.select import LEARNED, SELECTORS, weight_of
 from rpim_opt.data.dataset import Block, Dataset
@@ -98,15 +97,11 @@ def _problems(stated: Any, label: str = "") -> Iterator[tuple[str, Problem]]:
         paths: list[str | Path] = [stated]
         if not label and Path(stated).is_dir() and not Path(stated, "problem.toml").is_file():
             paths = [each.parent for each in sorted(Path(stated).glob("*/problem.toml"))]
-        if not paths:
-            raise InputError("problems", f"no problem.toml in '{Path(stated)}' or a folder in it", ACCEPTED)
         for path in paths:
             yield label or find_problem(path).name or str(path), load(path)
     elif isinstance(stated, Iterable) and not label:
         for problem in stated:
             yield from _problems(problem)
-    elif isinstance(stated, Program):
-        raise InputError("problems", "a program", f"{ACCEPTED}; ro.select.compare compares selectors on a program")
     elif callable(stated):
         yield label or _name(stated), stated
     else:

@@ -74,17 +74,6 @@ def test_the_page_says_of_many_problems_how_many_and_which_have_no_figure(tmp_pa
     assert "6 of 6 replicates" in all_of_them.read_text(encoding="utf-8")
 
 
-def test_ratios_beyond_the_figure_are_arrows_at_its_edge() -> None:
-    far = compared({"a": even(1.0), "b": even(1e4), "c": even(1e-4)})
-    near = compared({"a": even(1.0), "b": even(2.0), "c": even(0.5)})
-    arrows = [
-        sorted((line.get_marker(), float(line.get_xdata()[0])) for line in each.plot().axes[0].lines
-               if line.get_marker() in "<>")
-        for each in (far, near)
-    ]  # fmt: skip
-    assert arrows == [[("<", pytest.approx(1 / 30)), (">", pytest.approx(30))], []]
-
-
 def test_marks_tell_by_colour_what_is_better_and_what_worse() -> None:
     axes = compared({"a": even(1.0), "b": even(2.0), "c": even(0.5)}).plot().axes[0]
     marks = {round(line.get_xdata()[0], 6): line.get_color() for line in axes.lines if line.get_marker() == "D"}
