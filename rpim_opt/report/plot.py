@@ -5,9 +5,8 @@ The report's charts are the same figures.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import TransmissionError, Uncertainty
 from rpim_opt.convex.constraints import within_tolerance
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.rules.selection import Selection, weight_grid
+from rpim_opt.convex.rules.selection import weight_grid
 from rpim_opt.data.dataset import Dataset
 
 if TYPE_CHECKING:
@@ -30,10 +29,8 @@ if TYPE_CHECKING:
 __all__ = ["errors", "l_curve", "parameters"]
 
 Axes = Any  # matplotlib's, imported where axes are made
-COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e"}
+COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "ink": "#59636e"}
 """Colours by meaning, as in the page's style sheet, which has others in the dark."""
-SHAPES = "osD^v<>"
-SAME_MARK, LEGEND_WIDTH = 0.03, 44  # part of the axes within which rules share a mark; characters of its names a line
 CLOSE = 3.0  # ratio of an axis's ends below which a logarithmic one has ticks as a linear one has
 MANY_DOTS = 1000  # Dots beyond which they are one picture in a vector graphic.
 FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 6.0
@@ -145,11 +142,10 @@ def active_tolerance(result: Calibration) -> Array:
     return np.full(len(tolerance), np.inf)
 
 
-def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
-    """Draw the L-curve: root of the penalty against root of the loss over the weight, with the selectors' choices.
+def l_curve(of: Program | Calibration, ax: Axes = None) -> Axes:
+    """Draw the L-curve: root of the penalty against root of the loss over the weight; that of a result is marked.
 
-    The program is solved at 200 weights where it has a closed form, else at 40; InputError without a penalty. The
-    weight of a result is marked, and the selectors' choices, by name.
+    The program is solved at 200 weights where it has a closed form, else at 40; InputError without a penalty.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -160,10 +156,7 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     'residual norm [standard deviations of the noise]'
     >>> ax.figure.savefig("l_curve.pdf")
     """
-    program, own = (of.program, of.selector) if isinstance(of, Calibration) else (of, "")
-    marked = {name: choice.weight for name, choice in (selections or {}).items()}
-    if isinstance(of, Calibration):
-        marked.setdefault(own, of.weight)
+    program = of.program if isinstance(of, Calibration) else of
 
     def at(weight: float) -> list[Array]:
         """Return the curve's point at a weight, or none: far from the chosen one a solver may fail."""
@@ -177,27 +170,14 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     ax = _axes(ax)
     residual, solution = curve[curve[:, 1] > VANISHED * float(np.median(curve[:, 1]))].T
     ax.plot(residual, solution, color=COLORS["ink"], lw=1.5)
-    if own:
-        chosen = marked.pop(own)
-        for x, y in at(chosen):
-            _dots(ax, [x], [y], "mark", f"chosen: {own}, weight {chosen:.2g}")
+    if isinstance(of, Calibration):
+        for x, y in at(of.weight):
+            _dots(ax, [x], [y], "mark", f"chosen: {of.selector}, weight {of.weight:.2g}")
     norms = "residual norm [standard deviations of the noise]", "deviation norm [prior standard deviations]"
     ax.set(xlabel="root of the loss" if program.loss_form is None else norms[0])
     ax.set(ylabel="root of the penalty" if program.penalty_form is None else norms[1])
     logarithmic(ax, "x")
     logarithmic(ax, "y")
-    groups: list[tuple[Array, Array, list[str]]] = []  # a mark, its place as fractions of the axes, and its rules
-    for name in sorted(marked, key=lambda name: marked[name]):
-        for point in at(marked[name]):
-            place = (ax.transScale + ax.transLimits).transform(point)
-            if not groups or np.abs(place - groups[-1][1]).max() > SAME_MARK:
-                groups.append((point, place, []))
-            groups[-1][2].append(name)
-    for k, (point, _, names) in enumerate(groups):
-        ends = " to ".join(dict.fromkeys(f"{marked[name]:.2g}" for name in (names[0], names[-1])))
-        label = fill(f"{', '.join(names)}: weight {ends}", LEGEND_WIDTH)
-        style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 11, "ls": "none"}
-        ax.plot(*point, color=f"C{k}", label=label, **style)
     return _with_legend(ax)
 
 

@@ -44,7 +44,6 @@ from rpim_opt.use.validation import Validation
 MOST_FLAGGED = 200  # flagged rows that are named, the worst first
 LONGEST = 60  # characters of an argument of a penalty or constraint that is shown: an earlier result is a matrix
 WHY = {"learned": "maximum of the marginal likelihood"}  # reasons of choices that have no note; others were given
-L_CURVE_HEIGHT = 430.0
 
 
 def write_report(calibration: Calibration, path: str | Path, new: Mapping[str, Validation] | None = None) -> None:
@@ -467,21 +466,19 @@ def _regularization(content: Content) -> Iterator[Block]:
     by_user = Selection(result.weight, "given", np.array([]), np.array([]), True)
     chosen = {**select.compare(result.program), result.selector: result.selection or by_user}
     chosen = dict(sorted(chosen.items(), key=lambda item: item[1].weight))
-    marked = {rule: choice for rule, choice in chosen.items() if choice.weight > 0}
-    draw = partial(plot.l_curve, result, marked)
     title = "L-curve: residual norm against norm of the deviations"
     caption = (
         "Each point is the solution at one weight, from small weights at the upper left to large ones at "
         "the lower right."
     )
-    yield "figures", [figure(draw, title, caption, L_CURVE_HEIGHT)]
+    yield "figures", [figure(partial(plot.l_curve, result), title, caption)]
     name, data = next(iter(summary.sets(result).items()))
     problem = result.problem.on(data)
     rows = []
     for rule, choice in chosen.items():
         mean = ""
         with contextlib.suppress(NoSolutionFound):
-            if rule in marked:
+            if choice.weight > 0:
                 (estimate,) = result.program.path([choice.weight])
                 errors = problem.errors(result.problem.parameters.free.scale * estimate.z)
                 mean = mm(1e3 * float(np.nanmean(errors)))

@@ -53,8 +53,8 @@ def test_thousands_of_rows_are_one_picture(result) -> None:
 def test_paper_has_the_colours_of_the_page_in_light() -> None:
     style = (TEMPLATES / "page.css").read_text(encoding="utf-8")
     light = dict(re.findall(r"--(\w+): (#\w{6})", style.split("@media")[0]))
-    assert {role: COLORS[role] for role in ("before", "after", "mark", "other")} == {
-        role: light[role] for role in ("before", "after", "mark", "other")
+    assert {role: COLORS[role] for role in ("before", "after", "mark")} == {
+        role: light[role] for role in ("before", "after", "mark")
     }
     assert COLORS["ink"] == light["soft"]
 

@@ -21,19 +21,12 @@ def ax():
     plt.close(figure)
 
 
-def test_the_l_curve_marks_every_choice(ax, tmp_path) -> None:
+def test_the_l_curve_trades_residuals_for_deviations(ax, tmp_path) -> None:
     problem = ro.load("position").problem
-    program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
-    selections = {rule.__name__: rule(program) for rule in (ro.l_curve, ro.corner, ro.gcv, ro.reml)}
-    ro.plot.l_curve(program, selections, ax)
-    said = [" ".join(text.get_text().split()) for text in ax.get_legend().get_texts()]
-    assert sorted(name for each in said for name in each.partition(":")[0].split(", ")) == sorted(selections)
-    curve, *marks = ax.lines
+    ro.plot.l_curve(ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free)))), ax)
+    (curve,) = ax.lines
     assert (np.diff(curve.get_xdata()) > 0).all()  # the residual grows with the weight, the solution shrinks
     assert (np.diff(curve.get_ydata()) < 0).all()
-    places = [ax.transAxes.inverted().transform(ax.transData.transform(mark.get_xydata()[0])) for mark in marks]
-    assert len(said) == len(places) < len(selections)  # choices that are alike share a mark
-    assert all(np.abs(a - b).max() > 0.02 for a, b in pairwise(places))  # so that none covers another
     ax.figure.savefig(tmp_path / "l.svg")
 
 
