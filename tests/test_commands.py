@@ -23,8 +23,7 @@ import rpim_opt as ro
 from rpim_opt.basics.files import read_toml
 from rpim_opt.basics.layout import RawTable, TableOptions
 from rpim_opt.basics.units import parse_units
-from rpim_opt.data.measurements.pose import pose
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.tables.understanding import understand
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.library import read_arm

@@ -15,8 +15,7 @@ from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.measurements.pose import pose
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.record import HeldOut
 from rpim_opt.problem.diagnosis import common_rows
 from rpim_opt.problem.registration.closed_forms import register, transformed

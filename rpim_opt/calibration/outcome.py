@@ -40,7 +40,7 @@ from rpim_opt.convex.robust_loss import inliers_of
 from rpim_opt.convex.select import Selection
 from rpim_opt.convex.structure import INVARIANT
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import position
 from rpim_opt.data.record import Record
 from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel

@@ -16,7 +16,7 @@ from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration.covariance import UNLIKELY, coverage_factor, noise_covariances, position_noise, row_freedom
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import position
 from rpim_opt.data.record import CONFIDENCE, HeldOut
 from rpim_opt.robot.parameters import of_session
 from rpim_opt.robot.terms import transmission

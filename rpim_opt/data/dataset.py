@@ -16,8 +16,7 @@ from rpim_opt.basics.exceptions import InputError, RowError, pick
 from rpim_opt.basics.text import Brief, Tabled, counted
 from rpim_opt.basics.units import LARGEST, display
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.measurements.pose import from_matrices, pose
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import from_matrices, pose, position
 from rpim_opt.robot.parameters import session_prefix
 
 

@@ -17,7 +17,7 @@ from rpim_opt.basics.text import counted
 from rpim_opt.basics.threads import on_all_cores, one_blas_thread
 from rpim_opt.data.dataset import Dataset, whole_configurations
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import position
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.linear import LinearModel, Reweigh, reduced_models
 from rpim_opt.problem.noise import equation_numbers

@@ -15,7 +15,7 @@ from rpim_opt.basics.tables import numbers, read_columns
 from rpim_opt.basics.text import Brief, counted
 from rpim_opt.basics.units import UNITS, joint_columns, with_unit
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import position
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.problem import CalibrationProblem

@@ -16,7 +16,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, three_digits
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.measurements.position import from_elevation, from_zenith
+from rpim_opt.data.measurements.pose import from_elevation, from_zenith
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import proper, transforms

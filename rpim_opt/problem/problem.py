@@ -16,7 +16,7 @@ from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.text import Tabled, counted
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import position
 from rpim_opt.problem.contact import Features, Touches, contrasted, of_rows
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, Reweigh
 from rpim_opt.problem.noise import Equations, Repeatability, Stack, equation_numbers

@@ -13,7 +13,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.measurements.camera import INTRINSICS, eye_in_hand, pixels
 from rpim_opt.data.measurements.contact import revisit
 from rpim_opt.data.measurements.measurement import of_fixture
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks

@@ -17,8 +17,7 @@ from rpim_opt.basics.tables import EXCEL, Columns, read_columns
 from rpim_opt.basics.units import UNITS, split
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.measurements.pose import pose
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import seconds, time_column, together

@@ -23,8 +23,7 @@ from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.measurements.pose import pose
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import register, transformed

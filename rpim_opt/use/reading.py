@@ -21,8 +21,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
 from rpim_opt.data.measurements.contact import KNOWN
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.measurements.pose import pose
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.robot.chain import RobotSetup

@@ -12,7 +12,7 @@ from rpim_opt.basics.text import listed
 from rpim_opt.calibration.held_out import registered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import position
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_session, session_prefix

@@ -14,8 +14,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.tables import read_grid
 from rpim_opt.basics.units import parse_units
-from rpim_opt.data.measurements.pose import pose
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import together
 from rpim_opt.data.tables.understanding import Understood, understand

@@ -12,8 +12,7 @@ import rpim_opt as ro
 from rpim_opt.data.measurements.camera import on_board
 from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touches
 from rpim_opt.data.measurements.distance import plane
-from rpim_opt.data.measurements.pose import pose
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.tables.reading import declared_noise
 from rpim_opt.problem.blocks import partitions
 from rpim_opt.problem.registration.camera import starting_camera, with_poses

@@ -16,7 +16,7 @@ from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
 from rpim_opt.basics.units import LARGEST, SMALLEST, Unit, quantities, split_unit, with_unit
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.pose import position
 from rpim_opt.robot.mdh import Robot
 
 Numbers = dict[tuple[str, str], Array]
