@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import threading
 import time
 
@@ -58,12 +56,6 @@ def test_a_thread_of_many_starts_no_others(monkeypatch: pytest.MonkeyPatch) -> N
         assert below == [own] * 3
 
 
-def test_an_error_in_a_thread_is_the_callers(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(threads, "cores", lambda: 2)
-    with pytest.raises(ZeroDivisionError):
-        threads.on_all_cores(lambda k: 1 // k, range(3))
-
-
 @pytest.mark.parametrize("wrong", [0, 1, 5])
 def test_after_an_error_nothing_goes_on(monkeypatch: pytest.MonkeyPatch, wrong: int) -> None:
     """And of several errors the first one is told."""
@@ -80,53 +72,3 @@ def test_after_an_error_nothing_goes_on(monkeypatch: pytest.MonkeyPatch, wrong: 
         threads.on_all_cores(work, range(50))
     assert sorted(met) == list(range(wrong))
     assert threads.on_all_cores(lambda k: k, range(4)) == [0, 1, 2, 3]
-
-
-def test_threads_that_wait_for_each_other_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One asks with a lock in hand, which the blocks of the other need: there are threads for one of them alone."""
-    monkeypatch.setattr(threads, "cores", lambda: 2)
-    lock = threading.Lock()
-    done: list[str] = []
-
-    def holds() -> None:
-        for _ in range(100):
-            with lock:
-                threads.on_all_cores(lambda k: time.sleep(1e-4), range(4))
-        done.append("holds")
-
-    def needs() -> None:
-        def block(_: int) -> None:
-            with lock:
-                pass
-
-        for _ in range(100):
-            threads.on_all_cores(block, range(4))
-        done.append("needs")
-
-    both = [threading.Thread(target=each, daemon=True) for each in (holds, needs)]
-    for each in both:
-        each.start()
-    for each in both:
-        each.join(30)
-    assert sorted(done) == ["holds", "needs"]
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_fork_has_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The parent's are not there."""
-    monkeypatch.setattr(threads, "cores", lambda: 2)
-    assert threads.on_all_cores(lambda k: 2 * k, range(4)) == [0, 2, 4, 6]
-    child = os.fork()
-    if not child:
-        os._exit(threads.on_all_cores(lambda k: 2 * k, range(4)) != [0, 2, 4, 6])
-    for _ in range(1000):
-        ended, status = os.waitpid(child, os.WNOHANG)
-        if ended:
-            break
-        time.sleep(0.01)
-    else:
-        os.kill(child, signal.SIGKILL)
-        os.waitpid(child, 0)
-        pytest.fail("the child waits for threads that it does not have")
-    assert os.waitstatus_to_exitcode(status) == 0

@@ -7,7 +7,6 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.distance import anchor_start, plane_start, sphere_start
-from rpim_opt.robot.kinematics import numeric_frame
 
 POINTS = np.random.default_rng(3).normal([1.0, -2.0, 0.5], 0.3, size=(12, 3))
 """Of a tool, in a cell that is not about the origin [m]."""
@@ -20,22 +19,6 @@ def test_an_anchor_and_the_zero_of_its_lengths(zero: float) -> None:
     found = anchor_start(POINTS, lengths[:, None])
     assert list(found) == ["anchor_x", "anchor_y", "anchor_z", "length_0"]
     assert list(found.values()) == pytest.approx([*anchor, zero], abs=1e-10)
-
-
-def test_a_sphere() -> None:
-    centre = np.array([0.3, 2.0, -1.0])
-    away = POINTS - centre
-    on = centre + 0.7 * away / np.linalg.norm(away, axis=1)[:, None]
-    assert list(sphere_start(on, np.zeros((12, 1))).values()) == pytest.approx([*centre, 0.7], abs=1e-10)
-
-
-def test_a_plane() -> None:
-    normal = np.array([0.6, 0.0, 0.8])
-    on = POINTS - np.outer(POINTS @ normal - 1.5, normal)
-    found = plane_start(on, np.zeros((12, 1)))
-    x, y, z, *turn = found.values()
-    assert np.array([x, y, z]) @ normal == pytest.approx(1.5)
-    assert np.abs(numeric_frame([0, 0, 0, *turn])[:3, 2] @ normal) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("start", [anchor_start, plane_start, sphere_start])

@@ -11,7 +11,6 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.robot.extensions import _draws, moment_slopes
 from rpim_opt.robot.kinematics import numeric_frame
-from rpim_opt.robot.mdh import MOUNTINGS
 from tests.robot.test_exchange import urdf_kinematics
 from tests.simulate import ARM
 
@@ -336,10 +335,6 @@ def test_a_urdf_without_masses_leaves_the_guess_and_a_wrong_mass_is_named(tmp_pa
             ro.read_urdf(path, base="base", tip="tip")
     path.write_text(text.replace('value="0.5"', 'value="?"'))  # of a finger, beside the chain
     assert ro.read_urdf(path, base="base", tip="tip").robot.gravity.masses == pytest.approx((4.0, 4.0, 2.25))
-
-
-def test_mountings_are_where_gravity_points_in_the_base_frame() -> None:
-    assert MOUNTINGS == {"floor": (0.0, 0.0, -1.0), "ceiling": (0.0, 0.0, 1.0), "wall": (-1.0, 0.0, 0.0)}
 
 
 @pytest.mark.parametrize("direction", [(1.0, 2.0), ("a", 0, 0), (np.nan, 0, 1), (0.0, 0.0, 0.0), 3.0])

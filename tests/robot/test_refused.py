@@ -59,14 +59,6 @@ def test_a_table_of_some_angles_of_a_frame_is_added_up() -> None:
     assert not np.allclose(turned, np.add(full.nominal, [0.1, 0.2, 0.3]), atol=1e-3)
 
 
-def test_tolerances_are_shown_where_there_are_some() -> None:
-    parameters = ro.load("position").problem.parameters
-    rows = parameters.toleranced({"length_mm": 0.5}).free._frame_rows()
-    stated = {row["parameter"]: row.get("tolerance") for row in rows}
-    assert stated["d5"] == pytest.approx(0.5)
-    assert stated["alpha4"] is None
-
-
 def test_a_line_names_four_parameters_and_says_that_there_are_more() -> None:
     free = ro.load("position").problem.parameters.free
     names = ", ".join(free.names[:4])
