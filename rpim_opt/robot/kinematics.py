@@ -25,8 +25,7 @@ FRAME = ("x", "y", "z", "rx", "ry", "rz")
 
 FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True))
 
-ZERO, ONE = ca.SX(0), ca.SX(1)
-"""Made once: to make symbols of sixteen numbers takes longer than all the rest of a transform."""
+EYE = ca.DM(np.eye(4))  # dense, as all transforms are
 WIDTH = 256  # rows of one call: in the virtual machine their numbers stay in the processor's second cache
 SHARE = 16 * WIDTH  # rows that one thread evaluates before it takes more: enough to be worth handing over
 PAYS = 1_000  # rows from which a vectorized function pays: to build it takes as long as to evaluate twice as many
@@ -36,20 +35,17 @@ def rotation(axis: int, angle: Symbol) -> ca.SX:
     """Rot(x, angle) for axis 0, Rot(y, angle) for 1, Rot(z, angle) for 2."""
     c, s = ca.cos(angle), ca.sin(angle)
     j, k = (axis + 1) % 3, (axis + 2) % 3
-    rows = [[ONE if i == column else ZERO for column in range(4)] for i in range(3)]
-    rows[j][j], rows[j][k] = c, -s
-    rows[k][j], rows[k][k] = s, c
-    return _rows(*rows)
+    T = ca.SX(EYE)
+    T[j, j], T[j, k] = c, -s
+    T[k, j], T[k, k] = s, c
+    return T
 
 
-def translation(x: Symbol = ZERO, y: Symbol = ZERO, z: Symbol = ZERO) -> ca.SX:
+def translation(x: Symbol = 0.0, y: Symbol = 0.0, z: Symbol = 0.0) -> ca.SX:
     """Trans(x, y, z)."""
-    return _rows([ONE, ZERO, ZERO, x], [ZERO, ONE, ZERO, y], [ZERO, ZERO, ONE, z])
-
-
-def _rows(*rows: Sequence[Symbol]) -> ca.SX:
-    columns = zip(*rows, (ZERO, ZERO, ZERO, ONE), strict=True)  # CasADi counts columns first
-    return ca.reshape(ca.vertcat(*itertools.chain.from_iterable(columns)), 4, 4)
+    T = ca.SX(EYE)
+    T[:3, 3] = ca.vertcat(x, y, z)
+    return T
 
 
 def product(factors: Sequence[ca.SX]) -> ca.SX:
