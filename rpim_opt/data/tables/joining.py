@@ -274,19 +274,12 @@ def _normal(cells: Sequence[Any]) -> list[str]:
 def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.ndarray, Array]:
     """Return matching pairs of times (N,) and (M,) [s], and their differences (K,) [s].
 
-    Each of the fewer belongs to the nearest of the others; of several whose nearest is the same one, the nearest alone
-    (of equal times, all).
+    Times are partners if each is the nearest of the other ones to the other.
     """
-    if len(left) < len(right):
-        others, own, apart = partners(right, left, within)
-        order = np.argsort(own, kind="stable")
-        return own[order], others[order], -apart[order]
-    _, partner = scipy.spatial.KDTree(left[:, None]).query(right[:, None])
-    apart = right - left[partner]
-    least = np.full(len(left), np.inf)
-    np.minimum.at(least, partner, np.abs(apart))
-    rows = np.flatnonzero((np.abs(apart) <= within) & (np.abs(apart) == least[partner]))
-    return partner[rows], rows, apart[rows]
+    far, partner = scipy.spatial.KDTree(left[:, None]).query(right[:, None])
+    least, _ = scipy.spatial.KDTree(right[:, None]).query(left[:, None])
+    rows = np.flatnonzero((far <= within) & (far == least[partner]))
+    return partner[rows], rows, (right - left[partner])[rows]
 
 
 def _by_time(joints: Understood, values: Understood, key: str, within: float) -> Match:
