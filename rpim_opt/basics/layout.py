@@ -517,8 +517,6 @@ def _value_column(columns: Mapping[str, Sequence[str]]) -> str:
 
 def _names_parts(cells: Sequence[Any]) -> bool:
     """Return whether cells name x, y, z or the joints, and nothing else."""
-    if len(set(map(str, cells[:10]))) == 10:  # a column of numbers
-        return False
     names = sorted({str(cell).strip().lower() for cell in cells})
     return PARTS.fullmatch(" ".join(names)) is not None
 

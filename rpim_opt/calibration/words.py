@@ -138,7 +138,8 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
     """Return remarks on outliers, active bounds, an assumed noise and convergence; no advice beside reasons."""
     lines = _outlying(result, verdict.delivered)
     for held in [held for held in result.active_bounds if held.bound][:MOST_BOUNDS]:
-        unit, si = display(result.problem.parameters.dimension_of(held.name))
+        parameters = result.problem.parameters
+        unit, si = display(parameters.dimensions[parameters.names.index(held.name)])
         tenth = f"{0.1 * abs(held.bound) / si:.3g} {unit}"
         lines.append(
             f"Active bound: {held.name} at {held.bound / si:+.3g} {unit}. Loosening its tolerance by {tenth} would "

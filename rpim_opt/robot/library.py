@@ -11,13 +11,6 @@ from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.formats.tables import READY, SHEETS, read_robot, read_sheet
 
 ROBOT_FILES = (".toml", ".urdf", ".json", ".yaml", ".yml", *SHEETS)
-REFUSED = {
-    ".xacro": "a xacro file, which ROS's command expands (xacro arm.urdf.xacro > arm.urdf)",
-    ".xml": "an XML file, of MuJoCo or others",
-    ".mjcf": "a model of MuJoCo",
-    ".sdf": "an SDF file",
-}
-"""Files that describe robots, too, and are not read."""
 
 
 def robots() -> list[str]:
@@ -42,9 +35,9 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
         return READY / f"{name}.toml"
     accepted = "a file .toml, .urdf, .json, .yaml (Universal Robots' kinematics), or a DH table .csv, .md, .xlsx, ..."
     file = None if folder is None else folder / "problem.toml"
-    refused = REFUSED.get(Path(name).suffix.lower())
-    if refused:
-        raise InputError("key robot", f"'{name}', {refused}", accepted, file)
+    if name.endswith(".xacro"):
+        accepted = "a URDF, which ROS's command makes of it (xacro arm.urdf.xacro > arm.urdf)"
+        raise InputError("key robot", f"'{name}'", accepted, file)
     plain = re.sub(r"[^a-z0-9]", "", (name.split() or [""])[-1].lower())  # UR-10, Universal Robots UR10
     accepted = f"{accepted}, or a ready robot (rpim-opt robots): {choices(plain, ready)}"
     raise InputError("key robot", f"'{name}'", accepted, file)

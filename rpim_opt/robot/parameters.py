@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import chain
 from typing import Any
 
@@ -33,7 +33,6 @@ DEFAULT_SCALE = {
 """Default prior scales of deviations by (group, dimension) [SI]; terms state their own."""
 STEEL = 12e-6  # by how much steel grows [1/K]; aluminium by 23e-6
 SHOWN = 4  # names in one line
-KNOWN = 2**14  # names whose meaning is cached: those of a hundred robots
 NUMBERS = ("nominal", "scale", "tolerance", "identified")  # fields of `Parameters` that are arrays
 _TABLE = re.compile(rf"({'|'.join(MDH)})\d+")
 _TERM = re.compile(rf"({'|'.join(term.name for term in JOINT_TERMS)})\d+|bend\d+_\d+[xyz]")
@@ -47,26 +46,22 @@ def own_name(name: str) -> str:
     return name.rpartition(".")[2]
 
 
-@lru_cache(KNOWN)
 def of_joint(name: str) -> bool:
     """Return whether a parameter is of a joint, not of a frame."""
     own = own_name(name)
     return own == EXPANSION or bool(_TABLE.fullmatch(own) or _TERM.fullmatch(own))
 
 
-@lru_cache(KNOWN)
 def of_term(name: str) -> bool:
     """Return whether a parameter is of a joint's terms, not of the MDH table or of a frame."""
     return _TERM.fullmatch(own_name(name)) is not None
 
 
-@lru_cache(KNOWN)
 def is_joint_offset(name: str) -> bool:
     """Return whether a parameter is the offset of a revolute joint, which is set at assembly."""
     return re.fullmatch(r"theta\d+", own_name(name)) is not None
 
 
-@lru_cache(KNOWN)
 def group_of(name: str, dimension: str) -> str:
     """Return the scale group of a parameter: ``tool``, ``session``, ``base``, or its dimension."""
     frame = own_name(name).partition("_")[0]
@@ -121,8 +116,8 @@ class Parameters(Tabled):
 
     >>> import rpim_opt as ro
     >>> parameters = ro.load("position").problem.parameters
-    >>> len(parameters), len(parameters.free), parameters.dimension_of("tool_x")
-    (114, 34, 'length')
+    >>> len(parameters), len(parameters.free)
+    (114, 34)
     >>> few = parameters.identify(["d2", "theta2", "ecc_sin2", "tool_rx"]).free
     >>> few.groups, few.periodic, few.of_frames
     (('angle', 'length', 'angle', 'tool'), array([ True, False, False,  True]), array([False, False, False,  True]))
@@ -241,10 +236,6 @@ class Parameters(Tabled):
         """Return the deviations x (n,) [SI] of the same robot with every rotation in (-pi, pi]."""
         turns = np.ceil((x - np.pi) / (2 * np.pi))
         return x - 2 * np.pi * np.where(self.periodic, turns, 0.0)
-
-    def dimension_of(self, name: str) -> str:
-        """Return the dimension of a parameter: ``length``, ``angle``, ``ratio`` or ``compliance``."""
-        return self.dimensions[self.names.index(name)]
 
     def identify(self, patterns: str | Iterable[str]) -> Parameters:
         """Return the same table with just the parameters identified that match the pattern, or one of several.

@@ -207,17 +207,11 @@ def test_what_may_mean_two_things_is_refused(monkeypatch, capsys, tmp_path, arm,
     assert not (tmp_path / "cell").exists()
 
 
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [("arm.xml", "MuJoCo"), ("arm.mjcf", "MuJoCo"), ("arm.sdf", "SDF")],
-)
-def test_robots_of_other_programs_are_refused_by_name(monkeypatch, capsys, tmp_path, name, said) -> None:
+def test_a_xacro_file_is_refused_with_the_command_that_expands_it(monkeypatch, capsys, tmp_path) -> None:
     path = tmp_path / "raw.csv"
     path.write_text(text([HEAD], ROWS))
-    assert new(monkeypatch, tmp_path / name, tmp_path / "cell", path) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert ".urdf" in error
+    assert new(monkeypatch, tmp_path / "arm.urdf.xacro", tmp_path / "cell", path) == 2
+    assert "xacro arm.urdf.xacro > arm.urdf" in capsys.readouterr().err
 
 
 def test_joints_and_points_need_a_key(monkeypatch, capsys, tmp_path, arm) -> None:

@@ -149,13 +149,11 @@ def read_board(source: Any) -> dict[str, Array]:
     accepted = "point, x_mm, y_mm, perhaps z_mm"
     with in_file(source):
         table = read_columns(source)
-        names = texts(table.get("point", ()), "point")
-        if not names:
-            raise InputError("the header", f"no column point among {', '.join(table)}", accepted)
+        if {"point", "x", "y"} - {split_unit(name)[0] for name in table}:
+            raise InputError("the header", f"columns {', '.join(table)}", accepted)
+        names = texts(table["point"], "point")
         require_unique(names, "point")
         places = quantities_of(table, {axis: ["length"] for axis in "xyz"}, ["point"], names)
-        if ("x", "") not in places or ("y", "") not in places:
-            raise InputError("the header", f"columns {', '.join(table)}", accepted)
     flat = {("z", ""): np.zeros(len(names)), **places}
     return dict(zip(names, np.column_stack([flat[axis, ""] for axis in "xyz"]), strict=True))
 
