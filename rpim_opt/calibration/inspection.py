@@ -17,6 +17,7 @@ from rpim_opt.bayes.prior import Prior
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.lack_of_fit import LackOfFit, judged
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.words import contact_remarks
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.design import Observability, observe
 from rpim_opt.problem.diagnosis import LEAST_TRAVEL, all_q
@@ -212,7 +213,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None, prio
         warnings=tuple(_ranges(problem)),
         proposals=(proposal,) if needed else (),
         observability=observe(whole),
-        contact=tuple(contact_sentences(problem)),
+        contact=tuple(contact_remarks(problem)),
         fit=fit,
         lack_of_fit=fit and judged(fit),
     )
@@ -238,23 +239,3 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
             if not np.allclose(block.q[i], block.q[k]):
                 both = f"rows {label[k]} and {label[i]}"
                 yield f"{both} have the same measured values in different configurations: copied?"
-
-
-# What touches say
-
-
-def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
-    """Yield sentences on what touches identify and what they do not; none without touches."""
-    touches = problem.touches
-    if touches is None:
-        return
-    s = problem.linearize(np.zeros(len(problem.parameters.free))).svd[1]
-    kinds = {"points": touches.planar.count(False), "planes": touches.planar.count(True)}
-    things = " and ".join(f"{number} {name}" for name, number in kinds.items() if number)
-    yield (
-        f"{sum(map(len, touches.rows))} touches of {things}: {int(np.count_nonzero(s > 1))} of {len(s)} parameter "
-        "combinations are identified better than by their prior scales. Touches do not identify the base frame or the "
-        "offset of the first joint."
-    )
-    if all(tie.kind != "known_distance" for tie in touches.ties):
-        yield "The scale of the robot rests on its nominal lengths: a [[known_distance]] would determine it."

@@ -11,7 +11,6 @@ import scipy
 from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.model_selection import SESSIONS, SPEAK, WARMTH, Candidate, Comparison
@@ -214,10 +213,6 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
         within = max(again**2, 1e-24)
         if total / within >= fdtri(compared.spare, freedom, 1 - RARE):
             excess = float(np.sqrt(total - within))
-    try:
-        overstated = result.noise_test().overstated
-    except InputError:  # no covariance
-        overstated = False
     return LackOfFit(
         **known,
         repeatable=float(np.sqrt(share * total)),
@@ -230,7 +225,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
         upward=_upward(compared, present),
         repeated=again,
         excess=excess,
-        overstated=overstated,
+        overstated=not result.no_intervals and result.noise_test().overstated,
     )
 
 

@@ -180,18 +180,18 @@ def arm_length(problem: Source) -> float:
     )
 
 
-def worse_than_nominal(nominal: Array, identified: Array) -> bool:
-    """Whether errors (N,) of the identified robot are significantly larger, by the mean difference of the squares."""
+def worse_than_nominal(nominal: Array, identified: Array, rows: str = "") -> str:
+    """Return a sentence if errors (N,) [m] on some rows, or held-out ones, are larger than those of the nominal robot.
+
+    Significantly, by the mean difference of the squares; otherwise an empty text.
+    """
     both = np.isfinite(nominal) & np.isfinite(identified)
     difference = identified[both] ** 2 - nominal[both] ** 2
-    rows = len(difference)
-    if rms(identified[both]) > 2 * rms(nominal[both]):  # whatever few large errors make of the standard error
-        return True
-    return rows >= ROWS and bool(difference.mean() > WORSE * difference.std(ddof=1) / np.sqrt(rows))
-
-
-def worse_sentence(nominal: Array, identified: Array, rows: str = "") -> str:
-    """Return a sentence comparing errors (N,) [m] on some rows, or held-out ones, with those of the nominal robot."""
+    worse = rms(identified[both]) > 2 * rms(nominal[both])  # whatever few large errors make of the standard error
+    if len(difference) >= ROWS:
+        worse |= bool(difference.mean() > WORSE * difference.std(ddof=1) / np.sqrt(len(difference)))
+    if not worse:
+        return ""
     return (
         f"Errors on {rows or f'{len(nominal)} held-out rows'} are larger than those of the nominal robot: RMS "
         f"{three_digits(1e3 * rms(identified))} mm against {three_digits(1e3 * rms(nominal))} mm."
@@ -204,26 +204,21 @@ def worse_sentence(nominal: Array, identified: Array, rows: str = "") -> str:
 def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     """Say that residuals are beyond what instrument and robot make of them; of a camera in pixels and at the arm."""
     residuals = residual_rms(result, kept)
-    size = residuals["length"][0]
-    ratio = max(residuals["length"][1], residuals["pixel"][1])
-    share = size / arm_length(result.problem)
     checked = _overdetermined(result)
-    for each, (size_of, ratio_of) in residuals.items():
+    for each, (size, ratio) in residuals.items():
         nominal = noise_ratio(result.problem, result.nominal_errors(dimension=each), each)  # with frames fitted
-        small = 0 < min(ratio_of / OVERSTATED, NOISY * nominal) < 1  # 0: it was not measured
-        if checked and size_of > COMPUTED_RMS and small:
-            yield f"Residuals are {ratio_of:.2g} times the stated noise, which is in another unit or far too large."
-    if ratio > NOISY and share > REACH:
-        yield (
-            f"Residual RMS {three_digits(1e3 * size)} mm: {three_digits(ratio)} times the measurement noise and "
-            f"{three_digits(100 * share)} % of the arm's length; a robot's own errors stay below {100 * REACH:g} %."
-        )
-    size, ratio = residuals["angle"]
-    if ratio > NOISY and size > ANGULAR:
-        yield (
-            f"Residual RMS {three_digits(1e3 * size)} mrad: {three_digits(ratio)} times the measurement noise; a "
-            f"robot's own errors stay below {1e3 * ANGULAR:g} mrad."
-        )
+        small = 0 < min(ratio / OVERSTATED, NOISY * nominal) < 1  # 0: it was not measured
+        if checked and size > COMPUTED_RMS and small:
+            yield f"Residuals are {ratio:.2g} times the stated noise, which is in another unit or far too large."
+    for each, largest in {"length": REACH * arm_length(result.problem), "angle": ANGULAR}.items():
+        size, ratio = residuals[each]
+        if each == "length":
+            ratio = max(ratio, residuals["pixel"][1])
+        if ratio > NOISY and size > largest:
+            yield (
+                f"Residual RMS {in_unit(size, each)}: {three_digits(ratio)} times the measurement noise; a robot's own "
+                f"errors stay below {in_unit(largest, each)}."
+            )
 
 
 def _overdetermined(result: Outcome) -> bool:
@@ -281,9 +276,8 @@ def _cause(result: Outcome, i: int, largest: float) -> str:
 
 def _worse(result: Outcome) -> Iterator[str]:
     """Say that the robot misses rows by more than the nominal one, or that none is left to tell."""
-    nominal, identified = result.nominal_errors(), result.errors()
-    if worse_than_nominal(nominal, identified):
-        sentence = worse_sentence(nominal, identified, "the identification rows")
+    sentence = worse_than_nominal(result.nominal_errors(), result.errors(), "the identification rows")
+    if sentence:
         tight = ", or constraints are too tight" if result.formulation.constraints else ""
         yield f"{sentence.removesuffix('.')}: the weight is too large{tight}."
     held, validation = result.record.held_out, result.record.validation
@@ -297,7 +291,7 @@ def _worse(result: Outcome) -> Iterator[str]:
                 "of freedom, and no validation data check it. Measure more configurations."
             )
         return
-    said = worse_sentence(held.nominal, held.error) if worse_than_nominal(held.nominal, held.error) else ""
+    said = worse_than_nominal(held.nominal, held.error)
     if not said and rms(result.errors()) < rms(held.error):
         said = implausible(result, held)
     if said:

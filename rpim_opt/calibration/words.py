@@ -358,7 +358,7 @@ def known_points(problem: CalibrationProblem, data: Dataset) -> list[str]:
 
 
 def contact_remarks(problem: CalibrationProblem) -> list[str]:
-    """Return remarks on errors of touches; empty if there are none."""
+    """Return remarks on what touches show and what they do not; empty if there are none."""
     if problem.touches is None:
         return []
     nearest = []
@@ -369,7 +369,10 @@ def contact_remarks(problem: CalibrationProblem) -> list[str]:
     definition = f"Error of a touch: the modelled distance of the tool from {', or '.join(nearest)}"
     reach = "robots reach" if len(problem.arms) > 1 else "robot reaches"
     consistently = f"the error shows how consistently the {reach} them from all sides"
-    remarks = [f"{definition}. True places were not measured: {consistently}."]
+    remarks = [
+        f"{definition}. True places were not measured: {consistently}. Touches do not identify the base frame or the "
+        "offset of the first joint."
+    ]
     if not any(tie.kind == "known_distance" for tie in problem.touches.ties):
         remarks.append("The scale of the robot rests on its nominal lengths: a [[known_distance]] would determine it.")
     return remarks

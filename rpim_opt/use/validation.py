@@ -15,7 +15,7 @@ from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.held_out import coverage_text
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors, unregistered
-from rpim_opt.calibration.verdict import implausible, misread, worse_sentence, worse_than_nominal
+from rpim_opt.calibration.verdict import implausible, misread, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
@@ -49,14 +49,14 @@ class Validation(HeldOut):
         return float(np.nanmax(self.error))
 
     @property
-    def worse(self) -> bool:
-        """Whether the errors are significantly larger than those of the nominal robot."""
+    def worse(self) -> str:
+        """A sentence if the errors are significantly larger than those of the nominal robot; otherwise empty."""
         return worse_than_nominal(self.nominal, self.error)
 
     @property
     def failure(self) -> str:
         """Why the calibration fails on these measurements; empty where it does not."""
-        return self.mistake or (worse_sentence(self.nominal, self.error) if self.worse else "")
+        return self.mistake or self.worse
 
     @property
     def beyond(self) -> tuple[int, ...]:
@@ -78,7 +78,7 @@ class Validation(HeldOut):
             "touched": [dict(each) for each in self.touched],
             "remarks": self.remarks,
             "mistake": self.mistake,
-            "worse": self.worse,
+            "worse": bool(self.worse),
             "judged": bool(np.isfinite(self.sigmas).any()),
             "rows": records(self._rows()),
         }
@@ -117,8 +117,7 @@ class Validation(HeldOut):
             judgement = self.no_intervals or "No row has a prediction interval: data and penalty do not determine it."
         elif not named:
             judgement = f"No row is outside its prediction interval.{covered}"
-        worse = worse_sentence(self.nominal, self.error) if self.worse else ""
-        every = [worse, largest, judgement, *self.outside.sentences(), *self.remarks, self.mistake]
+        every = [self.worse, largest, judgement, *self.outside.sentences(), *self.remarks, self.mistake]
         return [sentence for sentence in every if sentence]
 
     def __str__(self) -> str:

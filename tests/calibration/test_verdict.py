@@ -132,8 +132,8 @@ def test_few_rows_tell_a_worse_robot_from_chance(rows: int) -> None:
     near = np.linalg.norm(nominal + 0.1 * rng.normal(size=nominal.shape), axis=2)
     far = 4 * np.linalg.norm(rng.normal(size=nominal.shape), axis=2)
     nominal = np.linalg.norm(nominal, axis=2)
-    assert sum(worse_than_nominal(a, b) for a, b in zip(nominal, near, strict=True)) <= 6
-    assert sum(worse_than_nominal(a, b) for a, b in zip(nominal, far, strict=True)) >= 350
+    assert sum(bool(worse_than_nominal(a, b)) for a, b in zip(nominal, near, strict=True)) <= 6
+    assert sum(bool(worse_than_nominal(a, b)) for a, b in zip(nominal, far, strict=True)) >= 350
 
 
 def test_a_robot_twice_as_wrong_as_the_nominal_one_is_worse_whatever_few_errors_are() -> None:

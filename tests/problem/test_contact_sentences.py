@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration.inspection import contact_sentences
+from rpim_opt.calibration.words import contact_remarks
 from rpim_opt.problem.diagnosis import (
     other_places,
     rounded,
@@ -34,14 +34,14 @@ def sockets(names: tuple[str, ...]) -> ro.CalibrationProblem:
 
 
 def test_the_scale_that_touches_show_is_said() -> None:
-    many = " ".join(contact_sentences(sockets(("A", "B", "C", "D"))))
-    assert "24 touches of 4 points" in many
+    many = " ".join(contact_remarks(sockets(("A", "B", "C", "D"))))
+    assert "the mean of all touches of its point" in many
     assert "a [[known_distance]] would determine it." in many
-    assert len(list(contact_sentences(ro.load("contact").problem))) == 1
-    planes = " ".join(contact_sentences(ro.load("datum_cube").problem))
-    assert " planes: " in planes
-    assert " points" not in planes.partition(":")[0]
-    assert list(contact_sentences(ro.load("position").problem)) == []
+    assert len(contact_remarks(ro.load("contact").problem)) == 1
+    planes = contact_remarks(ro.load("datum_cube").problem)[0]
+    assert "the best-fit plane of all its touches" in planes
+    assert " point" not in planes
+    assert contact_remarks(ro.load("position").problem) == []
     assert ro.load("position").problem.touched == ()
 
 
