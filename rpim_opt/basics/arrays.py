@@ -7,9 +7,25 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from rpim_opt.basics.exceptions import InputError
+
 Array = NDArray[np.float64]
 
 TINY = float(np.finfo(float).tiny)  # divisors are no smaller
+
+
+def finite_numbers(where: str, values: Any, *shapes: tuple[int, ...]) -> Array:
+    """Return values as an array; InputError unless they are finite numbers in one of some shapes."""
+    accepted = f"finite numbers of shape {' or '.join(map(str, shapes))}"
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(where, f"a {type(values).__name__}", accepted) from None
+    if array.shape not in shapes:
+        raise InputError(where, f"shape {array.shape}", accepted)
+    for row in np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))[:1]:
+        raise InputError(f"{where}, row {row + 1}", f"{array[row].tolist()}", accepted)
+    return array
 
 
 def rms(errors: Array) -> float:

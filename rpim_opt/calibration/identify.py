@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, finite_numbers
 from rpim_opt.basics.exceptions import pick
 from rpim_opt.basics.text import counted, joined
 from rpim_opt.basics.threads import one_blas_thread
@@ -20,7 +20,7 @@ from rpim_opt.bayes.hyperparameters import Estimator, require_finite
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import Statement
 from rpim_opt.calibration.certificate import DECREASE
-from rpim_opt.calibration.loop import FAR, ROUNDS, Ended, Iteration, Options, minimize, nearby, require_start
+from rpim_opt.calibration.loop import FAR, ROUNDS, Ended, Iteration, Options, minimize, nearby
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation, formulation_of, tikhonov
 from rpim_opt.convex.rules.selection import Selector
@@ -145,7 +145,7 @@ def calibrate(
     mapping: JointMapping | None = None
     stated: Source | None = None
     if start is not None:
-        start = require_start(start, len(problem.parameters.free))
+        start = finite_numbers("start", start, (len(problem.parameters.free),))
     else:
         if (found := find_mapping(problem)) is not None:
             mapping, problem = found

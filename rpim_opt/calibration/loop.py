@@ -16,7 +16,6 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Damping, Program, pose
 from rpim_opt.convex.robust_loss import QuadraticModel, inliers_of
 from rpim_opt.convex.rules.selection import SAME_WEIGHT, Selection, Selector, require_weight
-from rpim_opt.convex.select import weight_of
 from rpim_opt.convex.structure import in_blocks
 from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel
@@ -197,9 +196,8 @@ def _same(one: float, other: float, apart: float = SAME) -> bool:
     return abs(np.log(one / other)) <= apart
 
 
-def weight_choice(weight: float | str | Selector, penalized: bool) -> WeightChoice:
-    """Return the choice for a number, a selector, or the name of a ready selector; refuse anything else."""
-    weight = weight_of(weight)
+def weight_choice(weight: float | Selector, penalized: bool) -> WeightChoice:
+    """Return the choice for a number or a selector; refuse anything else."""
     if callable(weight):
         return WeightChoice(weight, settled=not penalized, final=not penalized)
     if isinstance(weight, bool) or not isinstance(weight, int | float | np.integer | np.floating):
@@ -282,7 +280,7 @@ class Loop:
             reweigh = reweigh.after(before)
         return around(self.source.linearize(self.scale * z, reweigh), *self.about)
 
-    def run(self, weight: float | str | Selector, start: Array | None) -> State:
+    def run(self, weight: float | Selector, start: Array | None) -> State:
         """Return the state at the end, from deviations ``start`` (n,) [SI]."""
         state = self.initial(weight_choice(weight, self.formulation.penalty is not None), start)
         while not state.outcome and state.evaluations <= self.options.max_iterations:
@@ -494,7 +492,7 @@ class Ended:
 
 
 def minimize(
-    problem: Source, formulation: Formulation, weight: float | str | Selector, start: Array | None, options: Options
+    problem: Source, formulation: Formulation, weight: float | Selector, start: Array | None, options: Options
 ) -> Ended:
     """Run the loop from deviations ``start`` (n,) [SI], and certify the result.
 
@@ -562,17 +560,3 @@ def damped(damping: float, gain: float, promised: float, effect: float) -> float
         if damping * effect <= DAMPING_LEAST * promised:
             return 0.0
     return damping
-
-
-def require_start(start: Array, count: int) -> Array:
-    """Return the checked start (n,) of the deviations."""
-    accepted = f"{count} finite deviations, one per parameter"
-    try:
-        x = np.asarray(start, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError("start", f"a {type(start).__name__}", accepted) from None
-    if x.shape != (count,):
-        raise InputError("start", f"shape {x.shape}", accepted)
-    if not np.isfinite(x).all():
-        raise InputError("start", "a value that is not finite", accepted)
-    return x

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from rpim_opt.basics.arrays import Array, rms, statistics
+from rpim_opt.basics.arrays import Array, finite_numbers, rms, statistics
 from rpim_opt.basics.exceptions import InputError, RowError, choices, pick
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import joined, listed, table
@@ -407,9 +407,11 @@ def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
     if rows is None:
         raise InputError("targets", "neither joint values nor poses", "q, poses, or both")
     N = len(np.atleast_1d(rows))
-    q = _rows("q", stated.q, N, (robot.dof,))
-    poses = _rows("poses", stated.poses, N, (7, 3))
-    torque = _rows("torque", stated.torque, N, (robot.dof,))
+    q, poses, torque = stated[1:4]
+    shape = max(N, 1), robot.dof
+    q = None if q is None else finite_numbers("q", q, shape)
+    torque = None if torque is None else finite_numbers("torque", torque, shape)
+    poses = None if poses is None else finite_numbers("poses", poses, (shape[0], 7), (shape[0], 3))
     if poses is not None and poses.shape[1] == 7:
         try:
             poses = pose.prepare(poses)[:, : 7 if orientation else 3]
@@ -418,20 +420,6 @@ def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
     if len(stated.label) not in (0, N):
         raise InputError("label", f"{len(stated.label)} labels", f"{N}, one per row")
     return Targets(stated.label or tuple(str(i) for i in range(1, N + 1)), q, poses, torque)
-
-
-def _rows(name: str, stated: Array | None, N: int, columns: tuple[int, ...]) -> Array | None:
-    if stated is None:
-        return None
-    values = np.asarray(stated, dtype=float)
-    if values.ndim != 2 or values.shape[1] not in columns or len(values) != N or not N:
-        accepted = " or ".join(f"({N or 'N'}, {k})" for k in columns)
-        raise InputError(name, f"shape {values.shape}", accepted)
-    finite = np.isfinite(values).all(axis=1)
-    if not finite.all():
-        row = int(np.argmin(finite))
-        raise InputError(f"{name}, row {row + 1}", f"{values[row].tolist()}", "finite numbers")
-    return values
 
 
 # --- the controller's robot beside the identified one ------------------------------------------------------
@@ -495,9 +483,7 @@ class _Cell(NamedTuple):
             raise InputError("--marker", found, f"{named}, or a controller's TCP by --tool")
         prefix = tool_prefix(marker)
         at = p.frame(prefix)
-        place = p.values(x)[at] if tool is None else np.asarray(tool, dtype=float)
-        if place.shape != (6,) or not np.isfinite(place).all():
-            raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
+        place = p.values(x)[at] if tool is None else finite_numbers("tool", tool, (6,))
         point = f"Target point: the stated tool, at {placed(place)} in the flange frame."
         if tool is None:
             how = "as identified, " if p.identified[at].any() else ""

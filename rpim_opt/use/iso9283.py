@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, finite_numbers
 from rpim_opt.basics.exceptions import InputError, of_file
 from rpim_opt.basics.tables import csv_text, numbers, read_columns, texts
 from rpim_opt.basics.text import Tabled, counted, listed, table
@@ -166,9 +166,7 @@ def _one_command(values: Array, name: str, what: str) -> Array:
 
 
 def _rows(values: Array, N: int, what: str) -> Array:
-    array = np.asarray(values, dtype=float)
-    if array.shape != (N, 3) or not np.isfinite(array).all():
-        raise InputError(what, f"shape {array.shape}", f"finite numbers of shape {(N, 3)}")
+    array = finite_numbers(what, values, (N, 3))
     far = np.abs(array).max(axis=1) > LARGEST
     if far.any():
         row = int(far.argmax())

@@ -10,8 +10,7 @@ import numpy as np
 import scipy
 from scipy.special import fdtrc, fdtri, ndtr, ndtri
 
-from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.arrays import Array, finite_numbers
 from rpim_opt.basics.tables import csv_text, records
 from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.outliers import by_block
@@ -179,9 +178,7 @@ def monitor(
     """
     count = len(data)
     if when is not None:
-        when = np.asarray(when, dtype=float)
-        if when.shape != (count,) or not np.isfinite(when).all():
-            raise InputError("monitor, when", f"shape {when.shape}", f"{count} finite times [s], one per check")
+        when = finite_numbers("monitor, when", when, (count,))
         order = np.argsort(when, kind="stable")
         data = data.take(order)
         when = when[order]
@@ -208,10 +205,12 @@ def monitor(
     )  # fmt: skip
 
 
-def _framed(problem: CalibrationProblem) -> tuple[CalibrationProblem, list[int]]:
-    """Return the problem with all frames identified, and the places of its bases among the deviations."""
+def _framed(problem: CalibrationProblem) -> tuple[CalibrationProblem, list[int], np.ndarray]:
+    """Return the problem with all frames identified, and which deviations are of its bases and of the problem."""
     framed = problem.identifying(problem.parameters.identified | problem.parameters.of_frames)
-    return framed, [i for i, name in enumerate(framed.parameters.free.names) if own_name(name).startswith("base_")]
+    names = framed.parameters.free.names
+    base = [i for i, name in enumerate(names) if own_name(name).startswith("base_")]
+    return framed, base, np.flatnonzero(np.isin(names, problem.parameters.free.names))
 
 
 def _innovations(
@@ -233,26 +232,26 @@ def _innovations(
     if C is None:
         raise result.no_covariance("`validate` gives errors without intervals")
     known = np.isfinite(np.diag(C))
-    framed, base = _framed(problem)
+    framed, base, mine = _framed(problem)
     # of sessions that the calibration does not know, and of motions
     wide = np.append(problem.parameters.free.scale[len(C) :], np.full(len(own) * len(base), MOTION))
     n = len(known)
     C = np.pad(np.where(np.outer(known, known), C, 0.0), (0, len(wide)))
     C[n:, n:] = np.diag(wide**2)
     m = np.zeros(len(C))
-    residual, slopes = problem.slopes(recalibration.previous_deviations(result, problem))
-    moves = framed.slopes(recalibration.previous_deviations(result, framed))[1][:, base]
+    residual, slopes = framed.slopes(recalibration.previous_deviations(result, framed))
     readings = noise_covariances(problem, result.variance_factor).reading
     rows: dict[int, tuple[Array, Array]] = {}
-    for (block, part), V in zip(by_block(problem, np.column_stack([residual, slopes, moves])), readings, strict=True):
+    for (block, part), V in zip(by_block(problem, np.column_stack([residual, slopes])), readings, strict=True):
         of_rows = zip(part, np.broadcast_to(V, (len(part), *V.shape[1:])), strict=True)
         rows |= zip(block.row.tolist(), of_rows, strict=True)
     freedom = max(result.freedom, 1.0)
     sigmas, p_values, degrees = np.zeros(len(rows)), np.full(len(rows), 0.5), np.zeros(len(rows), dtype=int)
     for t, (equations, V) in sorted(rows.items()):
-        J = np.hstack([equations[:, 1 : slopes.shape[1] + 1], np.kron(own[:, t], equations[:, slopes.shape[1] + 1 :])])
+        r, A = equations[:, 0], equations[:, 1:]
+        J = np.hstack([A[:, mine], np.kron(own[:, t], A[:, base])])
         S = J @ C @ J.T + V
-        e = equations[:, 0] - J @ m
+        e = r - J @ m
         s, U = scipy.linalg.eigh(S, V)
         told = s < UNINFORMATIVE
         degrees[t] = told.sum()
@@ -291,13 +290,14 @@ def cusum_limit(count: int, level: float) -> float:
 
 def _drift(result: Calibration, problem: CalibrationProblem, own: Array, level: float) -> Drift | None:
     """Return the change that explains checks best, set-ups moved or not; None where chance does, over all tried."""
-    model = problem.linearize(recalibration.previous_deviations(result, problem))
-    form = recalibration.penalty_of(recalibration.posterior_as_prior(result, problem), model.A.shape[1])
     # a frame may have moved whether it was identified or not: else the robot's parameters are blamed for it
-    framed, base = _framed(problem)
+    framed, base, mine = _framed(problem)
     free = framed.parameters.free
-    A = framed.linearize(recalibration.previous_deviations(result, framed)).A / np.sqrt(result.variance_factor)
-    model = replace(model, A=np.hstack([model.A, *(A[:, base] * rows[problem.owners, None] for rows in own)]))
+    form = recalibration.penalty_of(recalibration.posterior_as_prior(result, problem), len(mine))
+    model = framed.linearize(recalibration.previous_deviations(result, framed))
+    A = model.A / np.sqrt(result.variance_factor)
+    moves = [model.A[:, base] * rows[problem.owners, None] for rows in own]
+    model = replace(model, A=np.hstack([model.A[:, mine], *moves]))
     form = replace(form, L=np.pad(form.matrix, ((0, 0), (0, len(own) * len(base)))))
     # rows of one configuration were read together: the first of them has the time
     numbers, first = np.unique(problem.data.configuration, return_index=True)

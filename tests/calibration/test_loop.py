@@ -97,7 +97,7 @@ def test_at_rest_a_weight_is_asked_for_once_more() -> None:
 
 @pytest.mark.parametrize("start", [np.zeros(N - 1), np.zeros((N, 1)), np.full(N, np.nan), np.full(N, np.inf)])
 def test_a_start_that_does_not_fit_is_refused(start: np.ndarray) -> None:
-    with pytest.raises(ro.InputError, match="finite deviations, one per parameter"):
+    with pytest.raises(ro.InputError, match="accepted: finite numbers of shape"):
         ro.calibrate(PROBLEM, ro.tikhonov, 1.0, start=start)
 
 

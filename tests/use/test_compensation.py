@@ -569,14 +569,16 @@ def test_bad_input_is_answered_in_a_sentence(tmp_path: Path) -> None:
     result, q = known(), commands(ARM, 3)
     wrong = {
         "targets: found neither joint values nor poses": {},
-        r"q: found shape \(3, 5\), accepted: \(3, 6\)": {"q": q[:, :5]},
+        r"q: found shape \(3, 5\), accepted: finite numbers of shape \(3, 6\)": {"q": q[:, :5]},
         "q, row 2: found .* accepted: finite numbers": {"q": np.where([[0], [1], [0]], np.nan, q)},
-        r"poses: found shape \(3, 4\), accepted: \(3, 7\) or \(3, 3\)": {"poses": np.zeros((3, 4))},
+        r"poses: found shape \(3, 4\), accepted: finite numbers of shape \(3, 7\) or \(3, 3\)": {
+            "poses": np.zeros((3, 4))
+        },
         "poses, row 1: found a quaternion of norm 0": {"poses": np.zeros((3, 7))},
         r"torque: found shape \(2, 6\)": {"q": q, "torque": q[:2]},
         "largest: found 0": {"q": q, "largest": 0},
         "label: found 2 labels": {"q": q, "label": ("a", "b")},
-        r"tool: found \[1, 2\]": {"q": q, "tool": [1, 2]},
+        r"tool: found shape \(2,\)": {"q": q, "tool": [1, 2]},
         "marker: found 'B'": {"q": q, "marker": "B"},
     }
     for message, arguments in wrong.items():

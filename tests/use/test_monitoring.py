@@ -177,7 +177,7 @@ def test_times_order_the_checks() -> None:
     found = ro.use.monitor(result, data)
     shuffled = ro.use.monitor(result, data.take(order), 86400.0 * order)
     np.testing.assert_allclose(shuffled.sums, found.sums, atol=1e-6)
-    with pytest.raises(InputError, match="one per check"):
+    with pytest.raises(InputError, match="monitor, when: found shape"):
         ro.use.monitor(result, data, np.zeros(3))
 
 
