@@ -90,8 +90,12 @@ def registered(result: Calibration, data: Dataset, mine: np.ndarray | None = Non
     if used := rows_used(result, data):
         raise InputError("measurements", f"{len(used)} of {len(data)} rows are identification rows", "new rows only")
     vectors = result.error_vectors(data)
-    rows = np.flatnonzero(np.isfinite(vectors).all(axis=1) & mine)
-    measured = result.measured_positions(data)[rows]
+    measured = np.full_like(vectors, np.nan)
+    for block in data.blocks:
+        if block.measurement.name in (position.name, pose.name):
+            measured[block.row] = block.y[:, :3]
+    rows = np.flatnonzero(np.isfinite(measured).all(axis=1) & mine)
+    measured = measured[rows]
     predicted = measured - vectors[rows]
     first = register(measured, predicted)
     left = np.linalg.norm(predicted - transformed(first, measured), axis=1)

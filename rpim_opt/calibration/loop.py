@@ -32,7 +32,6 @@ EXACT, INTERIOR, BEST = 1e-12, 1e-8, 1e-11
 """Relative accuracy of an objective: of formulas and active sets, of interior points, and of these at their best."""
 VANISHING = 1e-12  # share of the first objective below which one has vanished: noise-free data end at rounding
 ROUNDING = 1e-9  # relative rise of an objective at a step that is rounding
-FIRST_ACCURACY = 0.01  # relative accuracy of the first solve: its linearization is no better
 FEW_ITERATIONS = 10  # iterations that are too few to begin with a weight that no rule was asked for
 NEAR_FIRST = 0.01  # share of the solution that the next step at the first weight may be when the rule is asked
 STALLED, STALLED_MOST = 2, 20
@@ -150,14 +149,6 @@ class WeightChoice:
             return replace(self, settled=True, final=True, note=again.note)
         return again
 
-    def kept(self, last: WeightChoice) -> WeightChoice:
-        """Return this choice as the final one, since at the last one deviations diverge."""
-        rule = last.selection.name if last.selection else "selector"
-        where = f"{last.weight:.2g} at last, where deviations exceed {FAR:.0f} prior standard deviations"
-        return replace(
-            self, final=True, note=f"The rule {rule} chooses {where}: {self.weight:.2g}, its choice before, is used."
-        )
-
     def _checked(self) -> WeightChoice:
         """Settle a rule that alternates, or never comes to rest, on the safer of its choices."""
         turns = [self.weights[0]]
@@ -196,7 +187,7 @@ def _same(one: float, other: float, apart: float = SAME) -> bool:
     return abs(np.log(one / other)) <= apart
 
 
-def weight_choice(weight: float | Selector, penalized: bool) -> WeightChoice:
+def weight_choice(weight: float | str | Selector, penalized: bool) -> WeightChoice:
     """Return the choice for a number or a selector; refuse anything else."""
     if callable(weight):
         return WeightChoice(weight, settled=not penalized, final=not penalized)
@@ -212,7 +203,7 @@ class State:
     ``size`` (n,) is the largest norm that each column of A has had, ``damping`` the weight of |size (step)|^2.
     ``stalled`` counts the evaluations since the objective was last lowered beyond its accuracy, to ``lowest``.
     ``outcome`` says why the loop ended (``"rest"``, ``"stuck"``, ``"far"``), ``floor`` is what vanishing objectives are
-    compared with. ``before`` is the state at rest with the weight that the rule chose before.
+    compared with.
     """
 
     z: Array
@@ -227,7 +218,6 @@ class State:
     stalled: int = 0
     lowest: float = np.inf
     outcome: str = ""
-    before: State | None = None
 
     def weighted(self, choice: WeightChoice) -> State:
         """Return the state with another weight and its objective."""
@@ -280,7 +270,7 @@ class Loop:
             reweigh = reweigh.after(before)
         return around(self.source.linearize(self.scale * z, reweigh), *self.about)
 
-    def run(self, weight: float | Selector, start: Array | None) -> State:
+    def run(self, weight: float | str | Selector, start: Array | None) -> State:
         """Return the state at the end, from deviations ``start`` (n,) [SI]."""
         state = self.initial(weight_choice(weight, self.formulation.penalty is not None), start)
         while not state.outcome and state.evaluations <= self.options.max_iterations:
@@ -332,7 +322,7 @@ class Loop:
         choice = state.choice.confirmed(self._judged(state))
         if choice.weight == state.choice.weight:
             return replace(state, choice=choice)
-        return replace(state.weighted(choice), outcome="", before=None if state.far else state)
+        return replace(state.weighted(choice), outcome="")
 
     def answered(self, state: State) -> State:
         """Apply a rule that was not applied yet."""
@@ -354,19 +344,17 @@ class Loop:
 
     def advanced(self, state: State) -> State:
         """Solve the convex program at z; converge if it predicts no decrease, else step to its minimum, or damp."""
-        if state.far and state.before is not None:
-            before = state.before
-            return replace(before, choice=before.choice.kept(state.choice))
         if state.far and state.evaluations > FAR_ITERATIONS:
             return replace(state, outcome="far")
         try:
-            solution, promised = self._predicted(state)
+            solution = self._solved(state.program, state)
         except NoSolutionFound:
             if not 0 < state.damping <= DAMPING_MOST:
                 raise
             # hardly identified directions, which damping bounds
             return replace(state, damping=DAMPING_GROWTH * state.damping, evaluations=state.evaluations + 1)
         choice, length = state.choice, state.relative(float(np.linalg.norm(solution - state.z)))
+        promised = state.merit - state.program.objective(solution, choice.weight)
         accuracy, best = self._accuracy(state)
         short, nothing = length <= self.options.tolerance, promised <= accuracy
         if state.damping > 0 and (short or nothing) and state.stalled < STALLED_MOST:
@@ -378,18 +366,6 @@ class Loop:
         if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
             return self.answered(state)
         return self._stepped(state, solution, promised, short, accuracy)
-
-    def _predicted(self, state: State) -> tuple[Array, float]:
-        """Return the minimum (n,) of the convex program, and by how much the objective falls there if that holds."""
-        # the first linearization is good for a rough minimum, unless that promises too little to judge by
-        first = state.program.separable and not (state.history or state.damping or self.options.solver)
-        rough = FIRST_ACCURACY if first else 0.0
-        solution = self._solved(state.program, state, rough)
-        promised = state.merit - state.program.objective(solution, state.choice.weight)
-        if rough and promised <= 10 * rough * abs(state.merit):
-            solution = self._solved(state.program, state)
-            promised = state.merit - state.program.objective(solution, state.choice.weight)
-        return solution, promised
 
     def _stepped(self, state: State, solution: Array, promised: float, short: bool, accuracy: float) -> State:
         """Step to a minimum if the nonlinear objective falls, else damp; one below ``accuracy`` promises nothing."""
@@ -414,11 +390,11 @@ class Loop:
             return replace(state, outcome="stuck")
         return state
 
-    def _solved(self, program: Program, state: State, accuracy: float = 0.0) -> Array:
+    def _solved(self, program: Program, state: State) -> Array:
         o = self.options
         damping = Damping(state.z, np.diag(np.sqrt(state.damping) * state.size)) if state.damping else None
         how = {"solver": o.solver, "settings": o.settings, "verbose": o.verbose}
-        return program.solve(state.choice.weight, damping=damping, accuracy=accuracy, **how).z
+        return program.solve(state.choice.weight, damping=damping, **how).z
 
     def _accelerated(self, state: State, solution: Array) -> Array:
         """Let a step follow the curve of the residual: the program again, with b moved by half the curvature along it.
@@ -492,7 +468,7 @@ class Ended:
 
 
 def minimize(
-    problem: Source, formulation: Formulation, weight: float | Selector, start: Array | None, options: Options
+    problem: Source, formulation: Formulation, weight: float | str | Selector, start: Array | None, options: Options
 ) -> Ended:
     """Run the loop from deviations ``start`` (n,) [SI], and certify the result.
 

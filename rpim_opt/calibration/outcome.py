@@ -275,21 +275,6 @@ class Outcome:
         source, x = self._at(data, nominal)
         return np.concatenate([error_vectors(part, x) for part in source.rows()])
 
-    def measured_positions(self, data: Dataset | None = None) -> Array:
-        """Return the measured position of every row, (N, 3) [m]; the modelled one where none was measured."""
-        positions = []
-        for part in self._at(data)[0].rows():
-            points = np.empty((len(part.data), 3))
-            for block in part.data.blocks:
-                torque = None if block.torque is None else block.torque[:, 0]
-                of = (block.markers[0], torque, block.payload, block.columns, block.robot)
-                points[block.row] = self.forward(block.q[:, 0], *of)[:, :3, 3]
-                names = list(block.measurement.columns)
-                if {"x", "y", "z"} <= set(names):
-                    points[block.row] = block.y[:, [names.index(axis) for axis in "xyz"]]
-            positions.append(points)
-        return np.concatenate(positions)
-
     def errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
         """Return the norm of every row's residual, (N,) [m], of the identification data by default.
 

@@ -121,4 +121,3 @@ def test_errors_have_a_direction_where_a_position_was_measured() -> None:
         assert 0 < positions.sum() < len(length)
         want = result.nominal_errors() if nominal else result.errors()
         assert length[positions] == pytest.approx(want[positions], rel=1e-12)
-    assert np.isfinite(result.measured_positions()).all()
