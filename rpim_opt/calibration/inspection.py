@@ -33,7 +33,7 @@ class Inspection(Tabled):
 
     ``residual`` (N,) is the error of every row of the ``problem`` [m], robot nominal, identified frames fitted;
     ``repeated`` are groups of labels measured in the same configuration by the same reflector. ``warnings`` (limits,
-    coverage, copied values), ``proposals`` (what the problem file could say) and ``contact`` (what touches show) are
+    coverage, copied values, axes that are nearly parallel) and ``contact`` (what touches show) are
     sentences; ``observability`` is what the configurations can show. ``fit`` is a quick fit, a calibration of the
     geometry with estimated scales and noise, and ``lack_of_fit`` the components of its residuals, repeatability among
     them; None where there is no solution.
@@ -48,7 +48,6 @@ class Inspection(Tabled):
     residual: Array
     repeated: tuple[tuple[str, ...], ...]
     warnings: tuple[str, ...]
-    proposals: tuple[str, ...]
     observability: Observability
     contact: tuple[str, ...] = ()
     fit: Calibration | None = None
@@ -86,7 +85,7 @@ class Inspection(Tabled):
         return rows
 
     def _notes(self) -> list[str]:
-        notes = [*(f"Warning: {text}" for text in self.warnings), *(f"Proposal: {text}" for text in self.proposals)]
+        notes = [f"Warning: {text}" for text in self.warnings]
         if self.fit is None:
             return notes
         count = len(np.unique(self.problem.data.configuration))
@@ -145,7 +144,6 @@ class Inspection(Tabled):
             },
             "contact": self.contact,
             "warnings": self.warnings,
-            "proposals": self.proposals,
             "delivered": None if self.fit is None else self.fit.verdict.delivered,
             "judgement": self.judgement,
             "outliers": [row.label for row in self.outliers],
@@ -189,16 +187,13 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None, prio
     """
     if not problem.keeps_rows:
         raise InputError("inspect", "data in blocks", "one of them: inspect(part) for part in problem.rows()")
-    data, free = problem.data, problem.parameters.free.names
+    data = problem.data
     fitted, x = fitted_frames(problem)
     groups: list[tuple[str, ...]] = []
     for block in data.blocks:
         which = repeated(block)
         again = np.flatnonzero(np.bincount(which) > 1)
         groups += [tuple(data.label[i] for i in block.row[which == k]) for k in again]
-    needed = [name for name in near_parallel(problem.robot) if name not in free]
-    pairs = ", ".join(f"{name[4:]} and {int(name[4:]) + 1}" for name in needed)
-    proposal = f"the axes {pairs} are nearly parallel: add {', '.join(needed)} to `identify`."
     try:
         fit = calibrate(problem, prior=prior)
         fit = replace(fit, record=replace(fit.record, validation=validation))
@@ -211,7 +206,6 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None, prio
         residual=fitted.errors(x),
         repeated=tuple(groups),
         warnings=tuple(_ranges(problem)),
-        proposals=(proposal,) if needed else (),
         observability=observe(whole),
         contact=tuple(contact_remarks(problem)),
         fit=fit,
@@ -220,8 +214,12 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None, prio
 
 
 def _ranges(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which joints leave their limits or hardly move, and which rows may be copied."""
+    """Say which joints leave their limits or hardly move, which axes need a beta, and which rows may be copied."""
     robot = problem.robot
+    for name in near_parallel(robot):
+        axis = int(name.removeprefix("beta"))
+        if name not in problem.parameters.free.names:
+            yield f"the axes {axis} and {axis + 1} are nearly parallel: add {name} to `identify`."
     q = all_q(problem.data)
     for i, dimension in enumerate(robot.joint_dimensions):
         unit, si = display(dimension)

@@ -44,7 +44,6 @@ DAMPING_MOST = 1e30  # damping at which no step, however short, lowers the objec
 SAME_POSITIONS = 1e-4  # what a round may change, relative to 1 + |z|: the error of predicted positions is its square
 ROUNDS, LEAST_SHARE = 20, 1 / 8  # rounds at most; least share of the way to its solution at which the next linearizes
 ROUGH_TOLERANCE = 1e-3  # tolerance of fits between two estimates of hyperparameters: the last fit is exact
-ROUNDS_FARTHEST = 6  # rounds that choose anew where in a region the robot moves farthest: later they might circle
 SETTLED = 1e-3  # the weight is chosen anew while a step is longer than this share of the solution, then stays
 SAME = 0.01  # two weights are the same when their logarithms differ by no more
 SAME_SEARCH = float(np.log(SAME_WEIGHT))  # the same of weights from a search
@@ -247,7 +246,7 @@ class Loop:
     solved: Formulation
     reweigh: QuadraticModel | None
     options: Options
-    about: tuple[Array | None, Array | None] = (None, None)
+    about: Array | None = None
 
     @classmethod
     def of(cls, problem: Source, formulation: Formulation, options: Options) -> Loop:
@@ -268,7 +267,7 @@ class Loop:
         reweigh = self.reweigh
         if reweigh is not None and before is not None:
             reweigh = reweigh.after(before)
-        return around(self.source.linearize(self.scale * z, reweigh), *self.about)
+        return around(self.source.linearize(self.scale * z, reweigh), self.about)
 
     def run(self, weight: float | str | Selector, start: Array | None) -> State:
         """Return the state at the end, from deviations ``start`` (n,) [SI]."""
@@ -338,7 +337,7 @@ class Loop:
             return state.program.on_squares(state.program.inlier_model(state.z))
         x = self.scale * state.z
         inliers = inliers_of(self.formulation, *self.source.configuration_errors(x))
-        return state.program.on(around(self.source.linearize(x, inliers), *self.about))
+        return state.program.on(around(self.source.linearize(x, inliers), self.about))
 
     # --- one step --------------------------------------------------------------------------------------------
 
@@ -475,14 +474,14 @@ def minimize(
     Positions that constraints bound are linear about a point: then it runs again about its solution until they are
     those of the solution. Where solutions move as far as the point does, the next round linearizes between them.
     """
-    loop = replace(Loop.of(problem, formulation, options), about=(start, None))
+    loop = replace(Loop.of(problem, formulation, options), about=start)
     ended = _certified(loop, problem, loop.run(weight, start))
     if not ended.state.program.structure.predicts:
         return ended
-    about = farthest = ended.x
+    about = ended.x
     moved = np.zeros(len(about))
     for rounds in range(2, ROUNDS + 1):
-        loop = replace(loop, about=(about, farthest))
+        loop = replace(loop, about=about)
         before = ended
         ended = _certified(loop, problem, loop.run(weight, ended.x))
         history = (*before.state.history, *ended.state.history)
@@ -497,8 +496,6 @@ def minimize(
         share = max(1 / (1 + factor), LEAST_SHARE) if factor > 0.5 else 1.0
         moved = share * step
         about = about + moved
-        if rounds <= ROUNDS_FARTHEST:
-            farthest = about
     return replace(ended, settled=False)
 
 
@@ -515,7 +512,7 @@ def _certified(loop: Loop, problem: Source, state: State) -> Ended:
         anew = in_parts(problem.frozen())
         if isinstance(anew, CalibrationProblem):
             residual = lambda z: anew.whitened_residual(loop.scale * z)  # noqa: E731
-        model = around(anew.linearize(loop.scale * state.z), *loop.about)
+        model = around(anew.linearize(loop.scale * state.z), loop.about)
     certificate = certified(loop.solved, model, state.z, state.choice.weight, state.floor, residual, state.program)
     return Ended(state, loop.scale * state.z, certificate)
 

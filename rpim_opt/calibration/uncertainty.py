@@ -250,13 +250,13 @@ def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None =
     return replace(held, coverage=float(covered.mean()) if len(covered) else None)
 
 
-def unregistered(result: Outcome, data: Dataset, held: HeldOut, so: str = "register its rows (--register)") -> str:
-    """Say of which sessions the registration is unknown and rows have no interval, and so what; empty without such."""
+def unregistered(result: Outcome, data: Dataset, held: HeldOut) -> str:
+    """Say of which sessions the registration is unknown and rows have no interval; empty without such."""
     if result.no_intervals or not any(map(of_session, result.problem.parameters.free.names)):
         return ""
     sessions = {*data.session[np.isnan(held.sigmas)]} - {*result.problem.sample().data.session}
     named = listed(sorted(f"'{name}'" for name in sessions))
-    return named and f"Where the instrument stood in session {named} is unknown: {so}."
+    return named and f"Where the instrument stood in session {named} is unknown: register its rows (--register)."
 
 
 def required_coverage(rows: int) -> float:

@@ -579,11 +579,11 @@ class Identified(Parameters):
     farthest: Array | None = None
 
 
-def around(model: LinearModel, x: Array | None, farthest: Array | None = None) -> LinearModel:
-    """Return a model that predicts positions linearly about x (n,) [SI], regions at ``farthest``, by default x, too."""
+def around(model: LinearModel, x: Array | None) -> LinearModel:
+    """Return a model that predicts positions linearly about x (n,) [SI], where regions are looked at, too."""
     if x is None or not isinstance(model.parameters, Identified):
         return model
-    return replace(model, parameters=replace(model.parameters, at=x, farthest=x if farthest is None else farthest))
+    return replace(model, parameters=replace(model.parameters, at=x, farthest=x))
 
 
 def error_dimensions(block: Block) -> list[str]:

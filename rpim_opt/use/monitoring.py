@@ -11,7 +11,7 @@ import scipy
 from scipy.special import fdtrc, fdtri, ndtr, ndtri
 
 from rpim_opt.basics.arrays import Array, finite_numbers
-from rpim_opt.basics.tables import csv_text, records
+from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import noise_covariances
@@ -44,7 +44,7 @@ class Drift(NamedTuple):
 
     def content(self) -> dict[str, Any]:
         """Return it as a document [mm, deg]."""
-        moved = self.moved and {key: value for key, value in self.moved.content().items() if key != "name"}
+        moved = self.moved and self.moved.content()
         return {**self.cause._asdict(), "first": self.first, "steady": self.steady, "moved": moved}
 
 
@@ -105,7 +105,7 @@ class Monitoring:
 
     def csv(self) -> str:
         """Return the chart's points as CSV."""
-        return csv_text(self._columns(), zip(*self._columns().values(), strict=True))
+        return columns_csv(self._columns())
 
     def __str__(self) -> str:
         count = f"{len(self.label)} checks"
@@ -151,7 +151,7 @@ class Monitoring:
         columns: dict[str, Sequence[Any]] = {"label": self.label, **({"time": self.times} if self.times else {})}
         figures = {"error_mm": 1e3 * self.error, "sigmas": self.sigmas, "allowed_sigmas": self.allowed}
         figures["sum"] = self.sums
-        return columns | {name: [round(value, 6) for value in values.tolist()] for name, values in figures.items()}
+        return columns | {name: values.tolist() for name, values in figures.items()}
 
 
 def monitor(

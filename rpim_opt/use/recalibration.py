@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration.held_out import displacement, registered, registration
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import held_out_errors, transmission_errors, unregistered
+from rpim_opt.calibration.uncertainty import held_out_errors, transmission_errors
 from rpim_opt.calibration.verdict import refuse_misread
 from rpim_opt.convex.constraints import matching
 from rpim_opt.convex.expressions import SQUARES
@@ -304,14 +305,10 @@ def _errors(
 ) -> tuple[dict[str, dict[str, dict[str, float]]], str]:
     """Return statistics of the new and of held-out rows' errors before and after an update, and how to read them."""
     new = before = updated.problem.data
-    said = unregistered(
-        result, new, held_out_errors(result, new), "errors with the previous calibration are after registration"
-    )
-    if said:
-        try:
-            before = registered_again(result, new)[0]
-        except InputError:  # few rows
-            said = ""
+    said = ""
+    if any(map(of_session, result.problem.parameters.free.names)) and {*new.session} - {*result.problem.data.session}:
+        with suppress(InputError):  # few rows
+            before, said = registered_again(result, new)
     rows = {"new": (before, new), "held-out": (held_out, held_out)}
     errors = {key: {"before": result.errors(a), "after": updated.errors(b)} for key, (a, b) in rows.items() if a and b}
     figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}

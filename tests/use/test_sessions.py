@@ -172,7 +172,7 @@ def test_a_third_place_is_no_change_of_the_robot_and_says_nothing_of_it_before_i
     updated = ro.use.update(result, data)
     assert not updated.changed
     assert updated.errors["new"]["before"]["rms_mm"] < 0.1
-    assert "session 'third' is unknown: errors with the previous" in str(updated)
+    assert "Registered again: session 'third' was displaced as a whole by" in str(updated)
     assert updated.explained
     notes = ro.use.session_notes(ro.use.in_session(updated.result))
     for text in ("'third' x", "'near' (by rows before the update) x", "'far' (by rows before the update) x"):
