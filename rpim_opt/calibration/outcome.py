@@ -128,13 +128,9 @@ class Outcome:
         tangent = program.tangent(self.z, self.weight)
         if tangent is None:
             return ""
-        bare, best = program, None
-        if program.quadratic:  # a formula, which calls no function
-            best = program.ridge.minima(np.array([self.weight]))[0]
-        else:
-            bare = pose(replace(program.formulation, constraints=()), program.model)
+        bare = pose(replace(program.formulation, constraints=()), program.model)
         try:
-            best = bare.solve(self.weight).z if best is None else best
+            best = bare.solve(self.weight).z
             kept = bare.inlier_model(best)
         except (InputError, NoSolutionFound):
             return ""

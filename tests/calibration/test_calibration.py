@@ -164,12 +164,6 @@ def test_fewer_equations_than_parameters_need_a_penalty() -> None:
     assert ro.calibrate(problem, ro.tikhonov, 1.0).converged
 
 
-def test_a_start_has_one_deviation_a_parameter() -> None:
-    problem, _ = simulated()
-    with pytest.raises(ro.InputError, match=r"start: found shape \(3,\), accepted: finite numbers of shape \(34,\)"):
-        ro.calibrate(problem, ro.tikhonov, 1.0, start=np.zeros(3))
-
-
 def test_a_calibration_prints_itself() -> None:
     instance = ro.load("paper_arm")
     text = str(instance.calibrate())

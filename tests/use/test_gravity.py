@@ -394,9 +394,3 @@ def test_a_simulated_folder_bends_by_gravity_without_a_column_of_torques(tmp_pat
     assert 1e3 * result.errors(instance.validation).mean() < 0.02  # as good as the noise
     stiff = instance.problem.with_parameters(instance.problem.parameters.identify(["theta[2-6]"]))
     assert 1e3 * ro.calibrate(stiff, ro.tikhonov, 1.0).errors(instance.validation).mean() > 0.06
-
-
-def test_a_urdf_does_not_hold_what_bends(tmp_path: Path) -> None:
-    result, *_ = calibrated(arm())
-    with pytest.raises(ro.InputError, match=r"compliance2.*`export_files` fits these alone"):
-        ro.use.identified(result)
