@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial, reduce
+from functools import partial
 from itertools import combinations, permutations, product
 from typing import Any, NamedTuple
 
@@ -256,28 +256,20 @@ def _scaled(what: str, remedy: str, factors: Array | float) -> Misreading:
 def _of_poses() -> Iterator[Misreading]:
     """Yield readings with other orientations."""
 
-    def turned(what: str, remedy: str, change: Callable[[Any], Array]) -> Misreading:
-        return Misreading(what, remedy, lambda points: replace(points, turns=change(points.turns)))
+    def turned(what: str, remedy: str, change: Callable[[Rotation], Rotation]) -> Misreading:
+        def turns(points: Points) -> Points:
+            return replace(points, turns=change(Rotation.from_matrix(points.turns)).as_matrix())
 
-    def euler(axes: str, columns: Sequence[int] = (0, 1, 2), factor: Any = 1.0) -> Callable[[Array], Array]:
+        return Misreading(what, remedy, turns)
+
+    def euler(axes: str, columns: Sequence[int] = (0, 1, 2), factor: Any = 1.0) -> Callable[[Rotation], Rotation]:
         # angles rx, ry, rz, taken for roll, pitch, yaw, are about other axes or in another unit
-        def change(turns: Array) -> Array:
-            angles = Rotation.from_matrix(turns).as_euler("xyz") * factor
-            return np.asarray(Rotation.from_euler(axes, angles[:, list(columns)]).as_matrix())
+        return lambda R: Rotation.from_euler(axes, (factor * R.as_euler("xyz"))[:, list(columns)])
 
-        return change
+    def reordered(order: list[int]) -> Callable[[Rotation], Rotation]:
+        return lambda R: Rotation.from_quat(R.as_quat()[:, order])
 
-    def in_degrees(turns: Array) -> Array:
-        return np.asarray(Rotation.from_rotvec(np.degrees(Rotation.from_matrix(turns).as_rotvec())).as_matrix())
-
-    def reordered(order: list[int]) -> Callable[[Array], Array]:
-        return lambda turns: Rotation.from_quat(Rotation.from_matrix(turns).as_quat()[:, order]).as_matrix()
-
-    yield turned(
-        "inverted orientations (of the instrument in the tool's frame)",
-        "invert the rotations",
-        lambda turns: np.swapaxes(turns, 1, 2),
-    )
+    yield turned("inverted orientations (of the instrument in the tool's frame)", "invert the rotations", Rotation.inv)
     for where, order in (("last", [3, 0, 1, 2]), ("first", [1, 2, 3, 0])):
         remedy = "state the order of the quaternion's components (--quaternion); arrays have w first"
         yield turned(f"quaternions with w {where}", remedy, reordered(order))
@@ -298,7 +290,8 @@ def _of_poses() -> Iterator[Misreading]:
         yield turned(f"Euler angles with the other sign of {named}", "change it", euler("xyz", factor=sign))
     for factor, unit in ((180 / np.pi, "radians"), (0.9, "gon")):
         yield turned(f"Euler angles in {unit}", "convert them to degrees", euler("xyz", factor=factor))
-    yield turned("rotation vectors in radians", "convert them to degrees", in_degrees)
+    vectors = "rotation vectors in radians"
+    yield turned(vectors, "convert them to degrees", lambda R: Rotation.from_rotvec(R.as_rotvec(degrees=True)))
     for by, low, back in SLIPPED:
         what = f"orientations one row too {low} in the table"
         yield Misreading(what, f"move their columns one row {back}", partial(_slipped, None, by))
@@ -538,22 +531,8 @@ def sibling(problem: CalibrationProblem) -> Better | None:
 
 
 def _told(points: Points, chain: Sequence[Misreading], stated: float, left: float) -> Better:
-    """Return a chain of mistakes in words, each with what fits as well in its place: some differ by base and tool."""
-    same = []
-    for i, each in enumerate(chain):
-        behind = chain[i + 1 :]
-        changed = each.change(points)
-        alike = [each]
-        for other in each.others:
-            tried = other.change(points)
-            as_well = not behind
-            if behind and len(tried.row) == len(changed.row):  # the mistakes behind it are of so many rows
-                whole = reduce(lambda now, mistake: mistake.change(now), behind, tried)
-                as_well = bool(misfits([whole])[0] <= SAME * left)
-            if as_well:
-                alike.append(other)
-        same.append(alike)
-        points = changed
+    """Return a chain of mistakes in words, with what fits as well as the last: some differ by base and tool alone."""
+    same = [*([each] for each in chain[:-1]), [chain[-1], *chain[-1].others]]
     what = " and ".join(", or ".join(each.what for each in alike) for alike in same)
     remedy = "; ".join(", or ".join(each.remedy for each in alike) for alike in same)
     return Better(what, remedy, stated * points.extent, left * points.extent)
