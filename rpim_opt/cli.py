@@ -696,7 +696,6 @@ def compare(
     methods: Annotated[str, Option(help="Baselines: nominal,levenberg_marquardt,...")] = "",
     splits: Annotated[str, Option(help="Held-out data: folder, a fraction (0.25), or a number of folds.")] = "folder",
     counts: Annotated[str, Option(help="Numbers of configurations to identify from: 10,25; default: all.")] = "",
-    noise: Annotated[str, Option(help="Factors on the noise of the identification data: 1,3.")] = "1",
     seeds: Annotated[int, Option(min=1, help="Number of random draws.")] = 1,
     metrics: Annotated[str, Option(help="Metrics, the first one summarized: rms_mm,max_mm,...")] = "",
     against: Annotated[Text, Option(help="Reference method, such as 'tikhonov, reml'.")] = None,
@@ -714,8 +713,8 @@ def compare(
     words, numbers = console.listed_words, console.listed_numbers
     comparison = ro.compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),
-        counts=numbers(counts) or None, noise=numbers(noise), seeds=seeds, metrics=words(metrics) or USUAL,
-        workers=workers, journal=journal, resume=resume,
+        counts=numbers(counts) or None, seeds=seeds, metrics=words(metrics) or USUAL, workers=workers,
+        journal=journal, resume=resume,
     )  # fmt: skip
     summary = comparison.summary(against=against)
     written: list[Path] = []

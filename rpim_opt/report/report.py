@@ -43,6 +43,7 @@ from rpim_opt.use.validation import Validation
 
 MOST_FLAGGED = 200  # flagged rows that are named, the worst first
 LONGEST = 60  # characters of an argument of a penalty or constraint that is shown: an earlier result is a matrix
+L_CURVE_HEIGHT = 340.0  # [px], for the label of its axis
 WHY = {"learned": "maximum of the marginal likelihood"}  # reasons of choices that have no note; others were given
 
 
@@ -471,7 +472,7 @@ def _regularization(content: Content) -> Iterator[Block]:
         "Each point is the solution at one weight, from small weights at the upper left to large ones at "
         "the lower right."
     )
-    yield "figures", [figure(partial(plot.l_curve, result), title, caption)]
+    yield "figures", [figure(partial(plot.l_curve, result), title, caption, L_CURVE_HEIGHT)]
     name, data = next(iter(summary.sets(result).items()))
     problem = result.problem.on(data)
     rows = []

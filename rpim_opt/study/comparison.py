@@ -33,7 +33,7 @@ BOOTSTRAP_DRAWS = 4000
 CONFIDENCE = 0.95
 ROW_INCHES = 0.25  # height of a method in a figure
 LARGEST_RATIO = 30.0  # ratios beyond are drawn at the edge
-SAME_DATA = ("problem", "split", "fold", "count", "noise_factor", "seed")
+SAME_DATA = ("problem", "split", "fold", "count", "seed")
 """Columns in which two replicates of a pair agree: then they saw the same data."""
 Pair = tuple[Any, ...]
 Rows = Sequence[Mapping[str, Any]]
@@ -47,7 +47,6 @@ def compare(
     methods: Any = (),
     splits: Any = "folder",
     counts: Any = None,
-    noise: Any = 1.0,
     seeds: int | Iterable[int] = 1,
     metrics: Any = USUAL,
     options: Mapping[str, Any] | None = None,
@@ -72,8 +71,7 @@ def compare(
 
     ``splits`` are the configurations held out: ``"folder"``, the validation data of the problem; a part of its
     data (``0.25``); in how many folds (``5``), one replicate a fold. ``counts`` are of how many of the others to
-    identify from, by default all. ``noise`` are factors, 1 or more, on the noise of the data to fit: the missing part
-    is added, and declared. ``seeds`` are how many, or which: of generated problems, splits, draws and noise.
+    identify from, by default all. ``seeds`` are how many, or which: of generated problems, splits and draws.
 
     ``metrics`` are of the rows held out: ``"rms_mm"``, ``"mean_mm"``, ``"p95_mm"``, ``"max_mm"``, ``"rms_mrad"``,
     ``"fit_rms_mm"`` (of the rows that were fitted), ``"covered_percent"`` (of 95 % intervals), ``"seconds"``; or
@@ -81,8 +79,8 @@ def compare(
 
     ``workers`` are processes on this machine, -1 for all processors; or of a cluster, where ``joblib.parallel_config``
     names one. Finished replicates are written to the file ``journal``, with which a call with the same code (of the
-    Python files that are loaded) and arguments goes on: more seeds, splits, counts and factors may be added. It refuses
-    other code and arguments, and those that cannot be pickled. ``resume`` is False to start again; None refuses to
+    Python files that are loaded) and arguments goes on: more seeds, splits and counts may be added. It refuses other
+    code and arguments, and those that cannot be pickled. ``resume`` is False to start again; None refuses to
     drop what it has. ``progress`` is whether a bar is shown, or a function of the finished and the total number.
 
     InputError before anything is computed: for unknown names, words and numbers, and a journal of something else.
@@ -101,13 +99,12 @@ def compare(
     asked = problems_of(problems)
     compared = methods_of(formulations, selectors, methods, options or {})
     ways = splits_of(splits)
-    sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1, int)
-    factors = _numbers("noise", noise, "factors of 1 or more on the noise that was measured", 1, float)
+    sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1)
     if isinstance(seeds, int | np.integer) and not isinstance(seeds, bool):
         if seeds > MOST_DRAWS:
             raise InputError("seeds", f"{seeds}", f"at most {MOST_DRAWS} draws")
         seeds = range(max(int(seeds), 0))
-    numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0, int)
+    numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0)
     figured = metrics_of(metrics)
 
     def work(case: Mapping[str, Any]) -> studies.Work:  # which takes no more along than it needs
@@ -116,14 +113,14 @@ def compare(
     made = studies.provenance()
     drawn = {label for label, problem in asked.items() if not isinstance(problem, Instance)}
     cases: list[studies.Row] = []
-    for (label, problem), (split, size), count, factor in product(asked.items(), ways.items(), sizes, factors):
+    for (label, problem), (split, size), count in product(asked.items(), ways.items(), sizes):
         every = np.inf if callable(problem) else len(np.unique(problem.problem.data.configuration))
-        # what a seed changes: what is generated or held out, the noise, which configurations are drawn
-        seeded = callable(problem) or size > 0 or factor > 1 or (count is not None and count < every)
+        # what a seed changes: what is generated or held out, which configurations are drawn
+        seeded = callable(problem) or size > 0 or (count is not None and count < every)
         folds = range(1, max(int(size), 1) + 1)
         for seed, fold, (name, method) in product(numbered if seeded else numbered[:1], folds, compared.items()):
             case = {"problem": label, "method": name, "formulation": method.formulation, "selector": method.selector}
-            cases.append({**case, "split": split, "fold": fold, "count": count, "noise_factor": factor, "seed": seed})
+            cases.append({**case, "split": split, "fold": fold, "count": count, "seed": seed})
     path = None if journal is None else Path(journal)
     code: dict[str, str] = {}
     if path is not None:
@@ -139,7 +136,6 @@ def compare(
         "Methods": compared,
         "Held out": ways,
         "Configurations": ["all" if count is None else str(count) for count in sizes],
-        "Noise factors": [f"{factor:g}" for factor in factors],
         "Seeds": map(str, numbered),
         "Metrics": figured,
         "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
@@ -148,14 +144,13 @@ def compare(
     return Comparison(tuple(rows), tuple(figured), frozenset(drawn), settings, made)
 
 
-def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:
-    """Return numbers of a kind, ``int`` or ``float``, each once."""
+def _numbers(where: str, stated: Any, accepted: str, least: int) -> list[Any]:
+    """Return whole numbers, each once."""
     values = list(stated) if isinstance(stated, Iterable) else [stated]
-    kinds = (int, np.integer) if kind is int else (int, float, np.number)
-    right = [isinstance(v, kinds) and not isinstance(v, bool) and least <= v <= LARGEST for v in values]
+    right = [isinstance(v, int | np.integer) and not isinstance(v, bool) and least <= v <= LARGEST for v in values]
     if not values or not all(right):
         raise InputError(where, f"{stated!r}", accepted)
-    return list(dict.fromkeys(map(kind, values)))
+    return list(dict.fromkeys(map(int, values)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +158,7 @@ class Comparison:
     """Replicates of methods on problems, one row each.
 
     ``rows`` are plain tables: ``problem``, ``method``, ``formulation``, ``selector``, ``split``, ``fold``, ``count``
-    and ``noise_factor`` (as stated), ``seed``; ``status`` (``ok``, ``not delivered``, ``impossible``, ``failed``) with
+    (as stated), ``seed``; ``status`` (``ok``, ``not delivered``, ``impossible``, ``failed``) with
     its ``reason``; ``configurations`` and ``parameters`` that were fitted, the ``weight``, and the ``metrics``.
     ``drawn`` are problems that depend on the seed, ``asked`` the grid as text, ``made`` script, package, versions
     and time.
@@ -176,9 +171,6 @@ class Comparison:
     Comparison: 2 methods on 1 problem, 10 replicates (10 ok)
     >>> found.summary().standings[0].method, len(found.to_frame()), len(found.plot("max_mm").axes)
     ('tikhonov, learned', 10, 1)
-    >>> written = found.report("arms_compared")
-    >>> written.name, sorted(path.name for path in written.parent.iterdir())
-    ('README.md', ['README.md', 'comparison.png', 'comparison.svg', 'metrics.json', 'replicates.csv'])
     """
 
     rows: tuple[studies.Row, ...]

@@ -21,7 +21,7 @@ from rpim_opt.calibration.verdict import judge
 from rpim_opt.convex.formulation import FORMULATIONS, formulation_of, tikhonov
 from rpim_opt.convex.rules.selection import require_weight
 from rpim_opt.convex.select import LEARNED, SELECTORS, weight_of
-from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Record
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames
@@ -33,7 +33,6 @@ ACCEPTED = "a folder, a name, ro.load(...), a problem, or a function of a seed t
 RETURNS = "an instance, a simulated arm, a problem, or a pair of a problem and validation data"
 FOLDER = "folder"
 MOST_FOLDS = 10_000  # each is a calibration of its own, and is listed before the first begins
-NOISE_STREAM = 11  # stream of the noise that is added, apart from those that draw configurations
 NONE = "none"  # the selector of what has no weight
 BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
     "nominal": fitted_frames,
@@ -162,26 +161,8 @@ def _divided(instance: Instance, split: float, case: Mapping[str, Any]) -> tuple
         raise InputError("splits", "no validation data", accepted)
     if case["count"] is not None:
         data = data.configurations(case["count"], seed)
-    if case["noise_factor"] > 1:
-        data = add_noise(data, case["noise_factor"], seed)
     record = replace(instance.record, validation=held_out)
     return replace(instance, problem=instance.problem.on(data), record=record), held_out
-
-
-def add_noise(data: Dataset, factor: float, seed: int) -> Dataset:
-    """Return data with normal noise added to reach ``factor`` times the declared noise, which is updated.
-
-    To a row of covariance S comes noise of covariance (factor^2 - 1) S; it then declares factor^2 S.
-    """
-    rng = np.random.default_rng([seed, NOISE_STREAM])
-
-    def noisy(block: Block) -> Block:
-        k = block.covariance.shape[1]
-        root = np.sqrt(factor**2 - 1) * np.linalg.cholesky(block.covariance)
-        error = (root @ rng.standard_normal((len(block.y), k, 1)))[:, :, 0]
-        return replace(block, y=block.measurement.plus(block.y, error), covariance=factor**2 * block.covariance)
-
-    return replace(data, blocks=tuple(map(noisy, data.blocks)))
 
 
 # --- methods ---------------------------------------------------------------------------------------------------------

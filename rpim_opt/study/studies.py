@@ -52,12 +52,7 @@ class Metric:
 
 @dataclass(frozen=True)
 class Report:
-    """The answer of a study: a Markdown text, ``metrics`` by the names of its METRICS, matplotlib figures by name.
-
-    >>> from rpim_opt.study import Report
-    >>> Report("The error falls with the root of the number of poses.", {"mean error [mm]": 0.03}).metrics
-    {'mean error [mm]': 0.03}
-    """
+    """The answer of a study: a Markdown text, ``metrics`` by the names of its METRICS, matplotlib figures by name."""
 
     text: str
     metrics: Mapping[str, float] = field(default_factory=dict)

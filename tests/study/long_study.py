@@ -26,7 +26,6 @@ import os, time
 import numpy as np
 import rpim_opt as ro
 from rpim_opt.study import Metric, Report
-from rpim_opt.study.methods import add_noise
 
 QUESTION = "Do results depend on how often a study was killed?"
 METRICS = {{"error": Metric("lower", 0.1)}}
@@ -37,7 +36,7 @@ def cases(quick):
 def run(seed):
     time.sleep(float(os.environ.get("{WAIT}", "0")))
     instance = ro.load("position")
-    problem = instance.problem.on(add_noise(instance.problem.data, 2.0, seed))
+    problem = instance.problem.on(instance.problem.data.configurations(30, seed))
     found = ro.calibrate(problem, ro.tikhonov, 1.0)
     names = [name for name, free in zip(problem.parameters.names, problem.parameters.identified) if free]
     error = float(found.errors(instance.validation).mean())

@@ -143,23 +143,6 @@ def test_seeds_repeat_only_what_they_change() -> None:
     assert counted.rows[-1]["reason"] == "count: found 500, accepted: 1 to 40 configurations."
 
 
-def test_noise_that_is_added_is_declared_and_of_the_right_size() -> None:
-    from rpim_opt.study.methods import add_noise
-
-    data = ro.load("pose").problem.data
-    draws = [add_noise(data, 3.0, seed) for seed in range(60)]
-    block, after = data.blocks[0], draws[0].blocks[0]
-    np.testing.assert_allclose(after.covariance, 9 * block.covariance, rtol=1e-12)
-    moved = np.array([each.blocks[0].y[:, :3] - block.y[:, :3] for each in draws])
-    expected = np.sqrt(8 * block.covariance[0, 0, 0])
-    assert moved.std() == pytest.approx(expected, rel=0.03)  # 60 x 40 x 3 numbers: 0.9 % standard error
-    np.testing.assert_allclose(np.linalg.norm(after.y[:, 3:], axis=1), 1, rtol=1e-12)
-    found = ro.compare("position", selectors="reml", noise=[1, 5], seeds=3, progress=False)
-    errors = [row["rms_mm"] for row in found.rows]
-    assert len(errors) == 1 + 3
-    assert min(errors[1:]) > errors[0]
-
-
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
@@ -168,7 +151,6 @@ def test_noise_that_is_added_is_declared_and_of_the_right_size() -> None:
         ({"selectors": [True]}, "selectors: found True"),
         ({"selectors": -1.0}, "selectors: found '-1.0'"),
         ({"selectors": 10**400}, "selectors: found 10000.*, accepted: a finite number"),
-        ({"noise": 10**400}, "noise: found 10000.*, accepted: factors of 1 or more"),
         ({"seeds": 10**400}, "seeds: found 10000.*, accepted: at most 100000 draws"),
         ({"methods": "newton"}, "methods: found 'newton', accepted: a function of the problem, nominal"),
         ({"metrics": "rms"}, r"metrics: found 'rms', accepted: a function of a fit, rms_mm"),
@@ -176,7 +158,6 @@ def test_noise_that_is_added_is_declared_and_of_the_right_size() -> None:
         ({"splits": "half"}, "splits: found 'half'"),
         ({"splits": math.inf}, "splits: found inf"),
         ({"splits": [5, 1e308]}, r"splits: found 1e\+308, .* 2 to 10000"),
-        ({"noise": 0.5}, "noise: found 0.5, accepted: factors of 1 or more"),
         ({"counts": 0}, "counts: found 0, accepted: whole numbers, 1 or more"),
         ({"seeds": []}, r"seeds: found \[\], accepted: whole numbers"),
         ({"problems": "positon"}, "did you mean position"),
@@ -333,7 +314,7 @@ def test_two_processes_and_a_cluster_give_the_same(tmp_path: Path) -> None:
 
 def rows_of(errors: dict[str, dict[str, float | None]]) -> tuple[dict, ...]:
     """Return rows of methods on problems with given errors."""
-    common = {"split": "folder", "fold": 1, "count": None, "noise_factor": 1.0, "seed": 0}
+    common = {"split": "folder", "fold": 1, "count": None, "seed": 0}
     return tuple(
         {"problem": problem, "method": method, **common, "rms_mm": value, **said(value)}
         for method, by_problem in errors.items()

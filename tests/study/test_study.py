@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -347,33 +346,6 @@ def test_a_study_writes_all_its_results_or_none(toy, tmp_path: Path, monkeypatch
     resumed, _ = run_study("toy", out=out, resume=True)  # nothing is computed again
     assert "12 numbers" in resumed.text
     assert sorted(path.name for path in out.iterdir()) == sorted(before)
-
-
-def test_an_untracked_study_is_not_the_commits(tmp_path: Path, monkeypatch) -> None:
-    def git(*arguments: str) -> None:
-        command = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b", *arguments]
-        subprocess.run(command, check=True, capture_output=True)
-
-    (tmp_path / "studies").mkdir()
-    monkeypatch.setattr(studies, "STUDIES", tmp_path / "studies")
-
-    def made_by_toy() -> str:
-        return studies.made_by(tmp_path / "studies" / "toy.py", False, 1, {})
-
-    def of_study() -> str:
-        return made_by_toy().split("with rpim-opt")[0]
-
-    git("init")
-    git("commit", "--allow-empty", "-m", "first")
-    (tmp_path / "studies" / "toy.py").write_text("QUESTION = 1")
-    assert "untracked" in of_study()
-    git("add", "studies")
-    git("commit", "-m", "second")
-    (tmp_path / "notes.txt").write_text("nobody runs this")
-    (tmp_path / "studies" / "results").mkdir()
-    (tmp_path / "studies" / "results" / "README.md").write_text("of another study")
-    assert "untracked" not in of_study()
-    assert "dirty" not in of_study()
 
 
 def test_a_broken_table_of_replicates_is_one_sentence(toy, tmp_path: Path) -> None:
