@@ -11,17 +11,17 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, create_model, model_validator
+from pydantic import ConfigDict, Field, create_model
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import inside, read_toml
 from rpim_opt.basics.schema import Angle, Length, Name, Table, validate
-from rpim_opt.basics.units import accepted_units, fits, quantities, split_unit
+from rpim_opt.basics.units import fits, quantities, split_unit
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import FRAMES
 from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
-from rpim_opt.convex.constraints import BOX, WORKSPACE, Constraint, at_nominal, equal, parse, signed
+from rpim_opt.convex.constraints import BOX, WORKSPACE, Constraint, at_nominal, equal, parse
 from rpim_opt.convex.rules.selection import Selector, require_weight
 from rpim_opt.convex.select import LEARNED, SELECTORS
 from rpim_opt.data.dataset import Dataset
@@ -101,8 +101,6 @@ class Constraints(Table):
     """The keys of ``[constraints]``."""
 
     at_nominal: list[Name] = Field(default_factory=list)
-    positive: list[Name] = Field(default_factory=list)
-    negative: list[Name] = Field(default_factory=list)
     equal: list[list[Name]] = Field(default_factory=list)
     stated: list[str] = Field(default_factory=list)
     places: dict[Name, dict[str, Any]] = Field(default_factory=dict)
@@ -110,7 +108,6 @@ class Constraints(Table):
     def all(self, robot: Robot, data: Dataset) -> tuple[Constraint, ...]:
         """Return the constraint functions for a problem with this robot and identification data."""
         made = [at_nominal(*self.at_nominal)] if self.at_nominal else []
-        made += [signed(sign, *names) for sign, names in ((1, self.positive), (-1, self.negative)) if names]
         places: dict[str, Any] = {MEASURED: _rows(data, None)}
         for name, table in self.places.items():
             where = f"key constraints.places.{name}"
@@ -223,20 +220,12 @@ Figure = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class DistanceTable(Table):
-    """A known distance; ``mm = 50`` is short for ``distance_mm = 50``. One for validation is not used in the fit."""
+    """A known distance; one for validation is not used in the fit."""
 
     between: Pair
     validation: bool = False
     distance: Length
     sigma: Annotated[float | None, "length"] = None
-
-    @model_validator(mode="before")
-    @classmethod
-    def _distance(cls, table: Any) -> Any:
-        units = accepted_units("length")
-        if not isinstance(table, dict):
-            return table
-        return {f"distance_{key}" if key in units else key: value for key, value in table.items()}
 
 
 class AngleTable(Table):

@@ -57,8 +57,8 @@ def test_intervals_hold() -> None:
     ("table", "said"),
     [
         ('[[known_distance]]\nbetween = ["A", "J"]\ndistance_mm = 640\n', "known_distance 1.sigma_mm"),
-        ('[[known_distance]]\nbetween = ["A"]\nmm = 640\nsigma_mm = 0.1\n', "known_distance 1.between"),
-        ('[[known_distance]]\nbetween = ["A", "Q"]\nmm = 640\nsigma_mm = 0.1\n', "'Q'"),
+        ('[[known_distance]]\nbetween = ["A"]\ndistance_mm = 640\nsigma_mm = 0.1\n', "known_distance 1.between"),
+        ('[[known_distance]]\nbetween = ["A", "Q"]\ndistance_mm = 640\nsigma_mm = 0.1\n', "'Q'"),
         (
             '[[known_angle]]\nbetween = ["A", "J"]\ndeg = 45\nsigma_mrad = 0.1\n',
             "1.deg: found 45, accepted: 0 or 90",
