@@ -695,10 +695,7 @@ def compare(
     selector: Annotated[str, Option(help="learned,reml,l_curve,1.0,...: rules and weights.")] = "learned",
     methods: Annotated[str, Option(help="Baselines: nominal,levenberg_marquardt,...")] = "",
     splits: Annotated[str, Option(help="Held-out data: folder, a fraction (0.25), or a number of folds.")] = "folder",
-    counts: Annotated[str, Option(help="Numbers of configurations to identify from: 10,25; default: all.")] = "",
     seeds: Annotated[int, Option(min=1, help="Number of random draws.")] = 1,
-    metrics: Annotated[str, Option(help="Metrics, the first one summarized: rms_mm,max_mm,...")] = "",
-    against: Annotated[Text, Option(help="Reference method, such as 'tikhonov, reml'.")] = None,
     workers: Workers = 1,
     resume: Resume = None,
     out: Annotated[File, Option(help="Folder for the summary, the replicates and the figure.")] = None,
@@ -707,19 +704,16 @@ def compare(
 
     With --out every replicate is stored when it is finished, and README.md with the figure at the end.
     """
-    from rpim_opt.study.comparison import USUAL
-
     journal = None if out is None else out / "replicates.jsonl"
     words, numbers = console.listed_words, console.listed_numbers
     comparison = ro.compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),
-        counts=numbers(counts) or None, seeds=seeds, metrics=words(metrics) or USUAL, workers=workers,
-        journal=journal, resume=resume,
+        seeds=seeds, workers=workers, journal=journal, resume=resume,
     )  # fmt: skip
-    summary = comparison.summary(against=against)
+    summary = comparison.summary()
     written: list[Path] = []
     if out is not None and journal is not None:
-        written = [comparison.report(out, against=against)]
+        written = [comparison.report(out)]
         journal.unlink()
     document = {"replicates": comparison.rows, "made": comparison.made, "notes": summary.notes}
     return Answer(f"{comparison!r}\n\n{summary}", document, written=written)
