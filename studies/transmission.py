@@ -10,9 +10,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.stats import gmean
 
 import rpim_opt as ro
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.text import markdown
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.data.dataset import Dataset
@@ -82,9 +83,9 @@ def run(seed: int, cycles: int, count: int) -> dict[str, Any]:
     return {
         "dof": dof,
         "curves": curves,
-        "auto": 1e3 * _rms(found.errors(true)),
-        "geometry": 1e3 * _rms(geometry.errors(true)),
-        "undisturbed": 1e3 * _rms(undisturbed.errors(arm.true)),
+        "auto": 1e3 * rms(found.errors(true)),
+        "geometry": 1e3 * rms(geometry.errors(true)),
+        "undisturbed": 1e3 * rms(undisturbed.errors(arm.true)),
         "readings": ro.use.validate(found, rippled(arm.read)).coverage,
     }
 
@@ -106,7 +107,7 @@ def report(rows: Rows) -> Report:
         large, small = _recovered(part, wrist=False), _recovered(part, wrist=True)
         figures = [f"{a:.3f} ({b:.3f})" for a, b in zip(large[:2], small[:2], strict=True)]
         figures.append(f"{100 * large[2]:.1f} ({100 * small[2]:.1f})")
-        errors = [f"{_rms([row[kind] for row in part]):#.3g}" for kind in ("auto", "geometry", "undisturbed")]
+        errors = [f"{rms(np.array([row[kind] for row in part])):#.3g}" for kind in ("auto", "geometry", "undisturbed")]
         readings = f"{100 * np.mean([row['readings'] for row in part]):.1f}"
         lines.append([str(cycles), f"{100 * _admitted(part):.0f}", *figures, *errors, readings])
     text += markdown([*head, "undisturbed [mm]", "readings [%]"], lines)
@@ -115,7 +116,7 @@ def report(rows: Rows) -> Report:
     text += (
         f"\n\n{len(clean)} arms without ripple, of {counts} configurations: curves are admitted on "
         f"{sum(bool(row['curves']) for row in clean)} of them. Error of `model auto`, whatever it admits, over that of "
-        f"geometry: {_mean_ratio(ratio):.4f} in the geometric mean, {ratio.max():.3f} at most."
+        f"geometry: {gmean(ratio):.4f} in the geometric mean, {ratio.max():.3f} at most."
     )
     correlation, size, _ = _recovered(gears, wrist=False)
     metrics = {
@@ -123,9 +124,9 @@ def report(rows: Rows) -> Report:
         "correlation": correlation,
         "ratio": min(size, 1 / size),
         "covered": float(np.mean([curve["covered"] for row in gears for curve in row["curves"]])),
-        "over_geometry": _mean_ratio(np.array([row["auto"] / row["geometry"] for row in gears])),
+        "over_geometry": gmean([row["auto"] / row["geometry"] for row in gears]),
         "false_admissions": _admitted(clean),
-        "loss": _mean_ratio(ratio),
+        "loss": gmean(ratio),
     }
     errors = {
         f"{kind}, {cycles} cycles": [row[kind] for row in gears if row["cycles"] == cycles]
@@ -146,11 +147,3 @@ def _recovered(rows: Rows, wrist: bool) -> tuple[float, float, float]:
 
 def _admitted(rows: Rows) -> float:
     return float(np.mean([bool(row["curves"]) for row in rows]))
-
-
-def _mean_ratio(ratios: Array) -> float:
-    return float(np.exp(np.mean(np.log(ratios))))
-
-
-def _rms(errors: Any) -> float:
-    return float(np.sqrt(np.mean(np.square(errors))))

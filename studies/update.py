@@ -7,13 +7,13 @@ neither the first nor the last: eight new positions update the result, at 200 ot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.text import markdown
 from rpim_opt.calibration import Calibration
 from rpim_opt.data.dataset import Dataset
@@ -58,7 +58,7 @@ def run(seed: int) -> dict[str, Any]:
     first = ro.calibrate(arm.problem.on(arm.problem.data.take(np.arange(CALIBRATED))))
     joint = 1 + seed // 3 % (arm.problem.robot.dof - 2)
     noise = SIGMA * np.random.default_rng([seed, 17]).standard_normal((CHECKS, 3))
-    undisturbed = 1e3 * _rms(ro.calibrate(arm.problem).errors(arm.true))
+    undisturbed = 1e3 * rms(ro.calibrate(arm.problem).errors(arm.true))
     return {
         "crashes": [{**_updated(arm, first, joint, mrad), "undisturbed": undisturbed} for mrad in CRASHES],
         "checks": [_monitored(arm, first, joint, what, mrad, noise) for what, mrad in COURSES],
@@ -73,9 +73,9 @@ def _updated(arm: ro.study.SimulatedArm, first: Calibration, joint: int, mrad: f
     changed = [cause.name for cause in found.changes if cause.kind != "reading"]
     return {
         "mrad": mrad,
-        "updated": 1e3 * _rms(found.result.errors(unseen)),
-        "old": 1e3 * _rms(first.errors(unseen)),
-        "alone": 1e3 * _rms(ro.calibrate(arm.problem.on(after)).errors(unseen)),
+        "updated": 1e3 * rms(found.result.errors(unseen)),
+        "old": 1e3 * rms(first.errors(unseen)),
+        "alone": 1e3 * rms(ro.calibrate(arm.problem.on(after)).errors(unseen)),
         "held": ro.use.validate(found.result, _moved(first, arm.read, joint, size)).coverage,
         "found": bool(changed),
         "right": changed == [f"theta{joint + 1}"],
@@ -119,7 +119,7 @@ def report(rows: Rows) -> Report:
     text += markdown(*_crash_table(crashes)) + "\n\nChecks over time. Found: an alarm of any kind. Right: the joint is "
     text += "named as the cause.\n\n" + markdown(*_checks_table(checks))
     metrics = {
-        "over_undisturbed": _rms([row["updated"] for row in hard]) / _rms([row["undisturbed"] for row in hard]),
+        "over_undisturbed": _rms(hard, "updated") / _rms(hard, "undisturbed"),
         "held": _mean([each for part in crashes.values() for each in part], "held"),
         "named": _mean(hard, "right"),
         "accused": _mean(crashes[0.0], "found"),
@@ -159,9 +159,8 @@ def _percent(rows: Rows, what: str) -> str:
 
 
 def _spread(rows: Rows, kind: str) -> str:
-    found = [row[kind] for row in rows]
-    return f"{_rms(found):#.3g} ({np.percentile(found, 95):#.3g})"
+    return f"{_rms(rows, kind):#.3g} ({np.percentile([row[kind] for row in rows], 95):#.3g})"
 
 
-def _rms(errors: Sequence[float] | Array) -> float:
-    return float(np.sqrt(np.mean(np.square(errors))))
+def _rms(rows: Rows, kind: str) -> float:
+    return rms(np.array([row[kind] for row in rows]))
