@@ -9,7 +9,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.files import read_bytes
-from rpim_opt.basics.text import LONGEST, Tabled, shortened
+from rpim_opt.basics.text import LONGEST, Tabled, shortened, table
 from rpim_opt.basics.units import UNITS, split_unit
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
@@ -83,3 +83,10 @@ def test_texts_in_notebook_tables_stay_as_they_are() -> None:
     shown = Rows()._repr_html_()
     assert '<th scope="row">True</th><td>yes</td>' in shown
     assert '<th scope="row">None</th><td></td>' in shown
+
+
+def test_a_table_is_a_text_in_a_notebook_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = table(["name", "mm"], [["a2", "1.5"]])
+    assert "a2" in plain
+    monkeypatch.setattr("rich.console._is_jupyter", lambda: True)  # there rich shows what it is to print
+    assert table(["name", "mm"], [["a2", "1.5"]]) == plain

@@ -130,11 +130,6 @@ def test_standard_deviations_of_rows() -> None:
     assert by_row == pytest.approx(rows[:, None, None] ** 2 * np.eye(3))
     both = rows[:, None] * [1.0, 2.0, 3.0]
     assert ro.Dataset.of(q, y, both).blocks[0].covariance == pytest.approx(both[:, :, None] ** 2 * np.eye(3))
-    of_components = ro.Dataset.of(q[:3], y[:3], [1e-5, 2e-5, 3e-5]).blocks[0].covariance
-    assert len(of_components) in (1, 3)
-    assert of_components[0] == pytest.approx(np.diag([1e-5, 2e-5, 3e-5]) ** 2)
-    with pytest.raises(ro.InputError, match="sigma"):
-        ro.Dataset.of(q, y, [1e-5, 2e-5, 0.0, 4e-5])
 
 
 def test_configurations_at_the_same_joint_values_are_one_in_the_order_that_they_had() -> None:

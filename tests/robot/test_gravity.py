@@ -188,6 +188,7 @@ def test_mountings_are_words_or_a_vector() -> None:
     [
         ({"direction": (0, 0, 0)}, "direction of gravity: found"),
         ({"direction": (0, np.nan, 1)}, "three finite numbers"),
+        ({"direction": ("a", 0, 0)}, "three finite numbers"),
         ({"payload": -1.0}, "payload: found -1.0"),
         ({"masses": (1.0,)}, "one centre per mass"),
         ({"masses": (np.inf,), "centres": ((0, 0, 0),)}, "mass of a link: found inf"),
@@ -335,12 +336,6 @@ def test_a_urdf_without_masses_leaves_the_guess_and_a_wrong_mass_is_named(tmp_pa
             ro.read_urdf(path, base="base", tip="tip")
     path.write_text(text.replace('value="0.5"', 'value="?"'))  # of a finger, beside the chain
     assert ro.read_urdf(path, base="base", tip="tip").robot.gravity.masses == pytest.approx((4.0, 4.0, 2.25))
-
-
-@pytest.mark.parametrize("direction", [(1.0, 2.0), ("a", 0, 0), (np.nan, 0, 1), (0.0, 0.0, 0.0), 3.0])
-def test_a_direction_that_is_none_is_refused(direction: object) -> None:
-    with pytest.raises(ro.InputError, match=r"three finite numbers|a nonzero vector"):
-        ro.robot.Gravity(direction)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("link", [1, 2, 3, 4])
