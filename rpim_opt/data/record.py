@@ -81,11 +81,6 @@ class HeldOut:
     Fisher's F, which one of all N exceeds with probability 0.01. Both are NaN where the calibration has no covariance,
     or none in a direction that the row depends on. ``coverage`` is the share of lengths in the 95 % interval of a
     reading, without rows that a final fit excludes; None without covariance.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.calibration.refit_all(ro.load("position").calibrate())
-    >>> len(result.record.held_out.label), result.record.held_out.used, len(result.problem.data)
-    (40, 40, 80)
     """
 
     label: tuple[str, ...]

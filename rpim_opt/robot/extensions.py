@@ -163,17 +163,16 @@ def bend_names(robot: Robot) -> tuple[str, ...]:
     names = []
     for i in range(n):
         known: list[Array] = []
-        for k in range(i, n):
-            for a, axis in enumerate(AXES):
-                v = slopes[:, i, k, a] - slopes[:, i, k, a].mean()
-                size = float(np.linalg.norm(v))
-                # slopes are of size 1: this is a share of that
-                if size < SAME * np.sqrt(DRAWS):
-                    continue
-                v = v / size
-                if all(min(np.linalg.norm(v - u), np.linalg.norm(v + u)) >= SAME for u in known):
-                    known.append(v)
-                    names.append(f"bend{i + 1}_{k + 1}{axis}")
+        for k, a in np.ndindex(n, len(AXES)):
+            v = slopes[:, i, k, a] - slopes[:, i, k, a].mean()
+            size = float(np.linalg.norm(v))
+            # slopes are of size 1: this is a share of that
+            if size < SAME * np.sqrt(DRAWS):
+                continue
+            v = v / size
+            if all(min(np.linalg.norm(v - u), np.linalg.norm(v + u)) >= SAME for u in known):
+                known.append(v)
+                names.append(f"bend{i + 1}_{k + 1}{AXES[a]}")
     return tuple(names)
 
 

@@ -333,17 +333,9 @@ class Model:
     ``terms`` move joints, links, the base or the tool besides those that every arm has (``ratio``, ``ecc_cos``, ...,
     ``compliance``, ``backlash``, ``bend``); two parameters of one name, or one column in two dimensions, are refused.
 
-    A third harmonic, identified beside the parameters that the problem identifies already:
-
-    >>> import casadi as ca
-    >>> import rpim_opt as ro
-    >>> third = ro.robot.Term(lambda joint, size: size * ca.cos(3 * joint.q), {"third_mrad": 0.1}, joints=(2, 3))
-    >>> problem = ro.load("position").problem.with_model(ro.Model(terms=[third]))
-    >>> problem.parameters.free.names[-2:]
-    ('third2', 'third3')
-
     A tool that drifts with the hours of a column of the data:
 
+    >>> import rpim_opt as ro
     >>> drift = lambda tool, rate: [0, 0, rate * tool.column("hours"), 0, 0, 0]
     >>> model = ro.Model([ro.robot.Term(drift, {"drift_mm": 0.1}, at="tool", columns={"hours": ""})])
     >>> model.columns, model.names(("revolute", "revolute"))

@@ -81,10 +81,6 @@ class KnownDistance:
     """Known distance between two touched points or two parallel touched planes.
 
     ``between`` are their names, ``value`` [m] is greater than zero, ``sigma`` is its standard deviation [m].
-
-    >>> import rpim_opt as ro
-    >>> ro.data.KnownDistance(("left", "right"), 0.3, 5e-6).measurement.name
-    'known_distance'
     """
 
     between: tuple[str, str]
@@ -102,12 +98,8 @@ class KnownDistance:
 class KnownAngle:
     """Known angle between two touched planes: parallel or perpendicular.
 
-    ``between`` are their names, ``sigma`` is the standard deviation of the angle [rad].
-
-    >>> import rpim_opt as ro
-    >>> known = ro.data.KnownAngle(("top", "front"), parallel=False, sigma=5e-5)
-    >>> known.measurement.name, known.value  # by how much the angle differs from that [rad]
-    ('known_square', 0.0)
+    ``between`` are their names, ``sigma`` is the standard deviation of the angle [rad]; ``value`` is by how much the
+    angle differs from 0 or 90 degrees.
     """
 
     between: tuple[str, str]

@@ -421,7 +421,6 @@ class _Urdf:
         return upwards + [_Step(joint, False, joint.parent, joint.child, joint.origin) for joint in reversed(down)]
 
     def way(self, base: str | None, tip: str | None) -> _Way:
-        """Return the way from link ``base`` to link ``tip``."""
         steps = self.steps_between(base, tip)
         moving = [step for step in steps if step.joint.kind]
         if not moving:
@@ -447,7 +446,6 @@ class _Urdf:
         return _Way(steps, parts, Chain(np.array(origins), np.array(axes), tail), joints, names, joint_map, offsets)
 
     def _to_root(self, link: str) -> list[_Joint]:
-        """Return the joints from a link up to its root."""
         joints: list[_Joint] = []
         while link in self.above:
             joints.append(self.above[link])
@@ -508,7 +506,6 @@ def _read(path: Path) -> _Urdf:
 
 
 def _named(elements: Sequence[_Element]) -> dict[str, _Element]:
-    """Return elements by their names."""
     known: dict[str, _Element] = {}
     for element in elements:
         name = element.get("name", "")
@@ -520,7 +517,6 @@ def _named(elements: Sequence[_Element]) -> dict[str, _Element]:
 
 
 def _root_element(data: bytes) -> _Element:
-    """Return the root element."""
     top = _Placed("")
     stack = [top]
 
