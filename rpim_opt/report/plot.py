@@ -152,9 +152,6 @@ def l_curve(of: Program | Calibration, ax: Axes = None) -> Axes:
     >>> ax = ro.plot.l_curve(result)
     >>> print(ax.get_legend().get_texts()[0].get_text())
     chosen: reml, weight 1.5
-    >>> ax.get_xlabel()
-    'residual norm [standard deviations of the noise]'
-    >>> ax.figure.savefig("l_curve.pdf")
     """
     program = of.program if isinstance(of, Calibration) else of
 

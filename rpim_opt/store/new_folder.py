@@ -111,9 +111,6 @@ def new_problem(
     >>> made = ro.store.new_problem("cell7", str(arm / "robot.toml"), arm / "identification.csv", hold_out=0.25)
     >>> made.rows
     {'identification.csv': 7, 'validation.csv': 2}
-    >>> tried = ro.store.new_problem("cell8", str(arm / "robot.toml"), arm / "identification.csv", dry_run=True)
-    >>> tried.written, tried.understood.count
-    (False, 9)
     """
     folder = Path(folder)
     source = find_robot(str(robot))

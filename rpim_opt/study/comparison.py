@@ -26,7 +26,6 @@ from rpim_opt.study.methods import METRICS, UNDELIVERED, methods_of, metrics_of,
 
 USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")  # metrics of a comparison that states none
 MOST_DRAWS = 100_000  # each is a calibration of its own, and is listed before the first begins
-LARGEST = float(np.finfo(float).max)  # whole numbers may be larger than any double
 TIE = 0.01  # errors that differ by no more than this part are a tie
 ENOUGH = 5  # problems from which on an interval speaks of problems like them; with fewer, of these
 BOOTSTRAP_DRAWS = 4000
@@ -147,7 +146,7 @@ def compare(
 def _numbers(where: str, stated: Any, accepted: str, least: int) -> list[Any]:
     """Return whole numbers, each once."""
     values = list(stated) if isinstance(stated, Iterable) else [stated]
-    right = [isinstance(v, int | np.integer) and not isinstance(v, bool) and least <= v <= LARGEST for v in values]
+    right = [isinstance(v, int | np.integer) and not isinstance(v, bool) and v >= least for v in values]
     if not values or not all(right):
         raise InputError(where, f"{stated!r}", accepted)
     return list(dict.fromkeys(map(int, values)))
@@ -316,14 +315,6 @@ class Summary:
 
     Less of the ``metric`` is better; others are compared with the ``reference``. ``standings`` are one a method that
     has figures; ``notes`` state what the intervals refer to, and what is not delivered or has no results.
-
-    >>> import rpim_opt as ro
-    >>> found = ro.compare("position", ["tikhonov", "lasso"], ["reml", 1.0], splits=5)
-    >>> summary = found.summary(against="tikhonov, 1")
-    >>> [each.method for each in summary.standings]
-    ['tikhonov, 1', 'tikhonov, reml', 'lasso, 1']
-    >>> summary.notes[-1]
-    "lasso, reml: impossible, 5 of 5 replicates. Selector reml: found formulation 'lasso', accepted: ..."
     """
 
     metric: str
