@@ -182,9 +182,6 @@ def _accuracy(content: Content) -> Iterator[Block]:
             values = [f"{value / si:.1f}" for value, si in zip(found.workspace.q[-1], units.values(), strict=True)]
             named = " and ".join(sorted({name.rpartition("_")[2] for name in units}))
             lines.append(f"The maximum U is at joints {', '.join(values)} {named}.")
-        if found.repeatability is not None and not found.reasons:
-            least = f"{1e3 * found.repeatability:.3f} mm of the maximum U."
-            lines.append(f"Repeatability alone, with all parameters known: {least}")
         yield "bullets", lines
     yield "heading", "Accuracy"
     used = "Parameters are identified from the identification rows alone."
@@ -420,7 +417,7 @@ def _provenance(content: Content) -> Iterator[Block]:
             value = f"{low:.3g}" if high < 1.005 * low else f"{low:.3g} to {high:.3g}"
             components.setdefault(f"{value} {unit}".strip(), []).append(name)
         stated = "; ".join(f"{value} ({', '.join(names)})" for value, names in components.items())
-        rows.append([what, str(len(sigmas)), stated])
+        rows.append([what, str(sum(len(block.row) for block in of)), stated])
     head = ["data", "rows", "standard uncertainty"]
     yield "table", Table("Measurements and their stated standard uncertainties", head, rows, prose=True)
     if record.files:
