@@ -32,7 +32,7 @@ from rpim_opt.use.validation import validate
 from tests import SHARED
 from tests.robot.test_exchange import CONF, YAML_PLAIN
 from tests.simulate import ARM, simulated
-from tests.test_cli import no_luck, run
+from tests.test_cli import run
 
 BENCH, REAL = SHARED / "bench", SHARED / "data"
 HEADER = ["x1", "y1", "z1", *(f"joint_{i}" for i in range(1, 7))]
@@ -806,15 +806,6 @@ def test_bad_input_is_one_sentence_and_nothing_is_left(monkeypatch, capsys, desk
             assert "\n" not in text.strip()
     assert {path: path.read_bytes() for path in desk.rglob("*") if path.is_file()} == before
     assert not list(desk.glob("made*"))
-
-
-def test_no_solution_has_its_own_code(monkeypatch, capsys, made) -> None:
-    monkeypatch.setattr("rpim_opt.convex.program.minimum", no_luck)
-    monkeypatch.setattr("cvxpy.Problem.solve", no_luck)
-    assert run(monkeypatch, "calibrate", str(made), "--formulation", "minimax", "--json") == 3
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert "out of luck" in json.loads(said.err)["error"]
 
 
 def test_what_no_file_can_hold_is_named(monkeypatch, capsys, tmp_path) -> None:
