@@ -332,7 +332,6 @@ def calibrate(
     or without a limit the median U, which is above the error of the nominal robot.
     """
     with console.progress() as say:
-        from rpim_opt.calibration.verdict import likely_causes, mistakes
         from rpim_opt.report.summary import describe, summary
         from rpim_opt.store.problem_file import named_weight
 
@@ -347,14 +346,7 @@ def calibrate(
         learning = changes.get("weight", instance.weight) is None
         say("estimating the prior's scales" if learning else "choosing the weight")
         changes["progress"] = lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}")
-        try:
-            result = instance.calibrate(**changes)
-        except NoSolutionFound as error:  # where that has likely causes they are named
-            causes = [] if error.conflict else likely_causes(ro.calibrate(instance.problem, ro.tikhonov, weight=1.0))
-            if not mistakes(causes):
-                raise
-            advice = " ".join(causes).rstrip(".")
-            raise NoSolutionFound(error.formulation, error.weight, error.status, advice=advice) from None
+        result = instance.calibrate(**changes)
         without = [flag.label for flag in result.flagged if drop_outliers and flag.label not in result.clustered]
         if without:
             say("calibrating without outliers")
