@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.stats import gmean
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
@@ -348,9 +349,9 @@ def report(rows: list[dict[str, Any]]) -> Report:
         errors = _errors(rows, situation, seeds)
         ours = errors[OURS]
         peers = {method: e for method, e in errors.items() if not method.startswith("rpim_opt")}
-        best = min(peers, key=lambda method: _mean(peers[method]))
-        metrics[situation] = _mean(ours)
-        metrics[f"{situation} over best peer"] = _mean(ours) / _mean(peers[best])
+        best = min(peers, key=lambda method: gmean(peers[method]))
+        metrics[situation] = gmean(ours)
+        metrics[f"{situation} over best peer"] = gmean(ours) / gmean(peers[best])
         parts.append(f"## {situation}\n\n{_table(rows, situation, errors)}\n\n{_winners(errors)}\n")
     versions = sorted({row["versions"] for row in rows if row.get("versions")})
     text = "\n".join(parts) + f"\nVersions: {'; '.join(versions)}."
@@ -368,11 +369,6 @@ def _errors(rows: list[dict[str, Any]], situation: str, seeds: list[int]) -> dic
                 value if usable else np.inf
             )
     return {method: found[method] for method in METHODS if method in found}
-
-
-def _mean(values: Array) -> float:
-    """Return the geometric mean."""
-    return float(np.exp(np.mean(np.log(values))))
 
 
 def _interval(ratios: Array) -> tuple[float, float]:
@@ -401,7 +397,7 @@ def _said(errors: Array) -> str:
     failed = int(np.sum(~np.isfinite(errors)))
     if failed:
         return f"failed {failed} of {len(errors)}"
-    return f"{_mean(errors):.3f}"
+    return f"{gmean(errors):.3f}"
 
 
 def _bold(method: str) -> str:
@@ -419,9 +415,9 @@ def _table(rows: list[dict[str, Any]], situation: str, errors: dict[str, Array])
         over = "-"
         if method != OURS and good.all() and len(values) > 1:
             low, high = _interval(values / ours)
-            over = f"{_mean(values / ours):.2f} ({low:.2f} to {high:.2f})"
+            over = f"{gmean(values / ours):.2f} ({low:.2f} to {high:.2f})"
         elif method != OURS and good.all():
-            over = f"{_mean(values / ours):.2f}"
+            over = f"{gmean(values / ours):.2f}"
         changes = []
         for unit in ("mm", "mrad"):
             sizes = [row[f"largest_{unit}"] for row in own if row.get(f"largest_{unit}") is not None]
@@ -461,7 +457,7 @@ def _winners(errors: dict[str, Array]) -> str:
             if method in errors:
                 tool = method.partition(",")[0]
                 tools.setdefault(tool, []).append(method)
-        best = {tool: min(names, key=lambda name: _mean(errors[name])) for tool, names in tools.items()}
+        best = {tool: min(names, key=lambda name: gmean(errors[name])) for tool, names in tools.items()}
         least = np.argmin([errors[name] for name in best.values()], axis=0)
         counts = [f"{name} {int(np.sum(least == k))}" for k, name in enumerate(best.values())]
         parts.append(f"Arms on which each is the best, {what}: {'; '.join(counts)}.")
@@ -488,7 +484,7 @@ def _figure(rows: list[dict[str, Any]], situations: list[str], seeds: list[int])
             color = "C3" if method.startswith("rpim_opt") else "C0"
             ax.semilogx(values, [y] * len(values), "o", ms=3, alpha=0.35, color=color, mew=0)
             if len(values):
-                ax.semilogx([_mean(values)], [y], "|", ms=11, mew=2, color=color)
+                ax.semilogx([gmean(values)], [y], "|", ms=11, mew=2, color=color)
         ax.set_title(situation, fontsize=10)
         ax.xaxis.set_major_locator(LogLocator(subs=(1,)))
         ax.xaxis.set_major_formatter(ScalarFormatter())
