@@ -21,7 +21,6 @@ from rpim_opt.store.problem_file import FIELDS
 from rpim_opt.store.result_file import figures
 from rpim_opt.use.sessions import in_session, session_notes
 
-KEYS = ("verdict", "weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
 COLUMNS = ("rows", "mean", "RMS", "95th percentile", "max")
 Unit = Literal["mm", "mrad"]
 
@@ -116,12 +115,10 @@ def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None
     equations, unknowns = result.program.model.equations, len(result.x)
     few = f"; {equations} equations for {unknowns} parameters" if equations < unknowns else ""
     where = {
-        "validation": f"On {n} validation measurements, not used for identification,",
         "held out": f"On {n} measurements that were held out",
-        "new": f"On {n} new measurements, not used for identification,",
         "used": f"On {n} measurements, which were used for identification at least in part,",
         "identification": f"On the {n} identification measurements (no validation data{few})",
-    }[name]
+    }.get(name, f"On {n} {name} measurements, not used for identification,")
     what = "position error" if of_positions(result) else "error"
     ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
     change = f"rises from {mm(before['mean_mm'])} mm to {mm(after['mean_mm'])} mm"
@@ -229,11 +226,10 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         *warnings(result),
         *([result.message] if result.converged else []),
     ]
-    whole = figures(result)
     return {
+        **figures(result),
         "title": record.title,
         "source": record.source,
-        **{key: whole[key] for key in KEYS},
         "headline": " ".join(filter(None, [verdict, headline(result)])),
         "errors": errors,
         "orientation": orientation_rows(result),

@@ -237,12 +237,12 @@ class Comparison:
         summary = self.summary(metric, against)
         return _ratios(summary, figures(self.rows, summary.metric))
 
-    def report(self, folder: str | Path, metric: str | None = None, against: str | None = None) -> Path:
+    def report(self, folder: str | Path) -> Path:
         """Write ``README.md`` with the summary and the medians by problem, the figure, and ``replicates.csv``.
 
-        The folder is made; other arguments as for `summary`. Return the path of ``README.md``.
+        The folder is made. Return the path of ``README.md``.
         """
-        summary = self.summary(metric, against)
+        summary = self.summary()
         of = figures(self.rows, summary.metric)
         medians = []
         for each in summary.standings:
@@ -259,7 +259,7 @@ class Comparison:
         replicates = csv_text(self.rows[0], (row.values() for row in self.rows))
         where = ", ".join(self.problems) if len(self.problems) <= 3 else f"{len(self.problems)} problems"
         ratios = {each.method: each.ratio for each in summary.standings if each.ratio is not None}
-        report = studies.Report(text, ratios, {"comparison": self.plot(metric, against)})
+        report = studies.Report(text, ratios, {"comparison": self.plot()})
         made = "\n\n".join(f"{name}: {what}" for name, what in self.made.items())
         title = f"{len(self.methods)} methods on {where}"
         studies.write(Path(folder), title, report, made, {"replicates.csv": replicates.encode()})
