@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import get_lapack_funcs
@@ -13,7 +13,6 @@ from scipy.linalg import svd as scipy_svd
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Brief, counted
-from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.parameters import Parameters
 
 RANK_TOLERANCE = 1e-10
@@ -69,19 +68,8 @@ class LinearModel(Brief):
 
     @cached_property
     def triangle(self) -> Array:
-        """QR factor R (n+1, n+1) of [A b], upper triangular: |A z - b| = |R [z; -1]| for every z.
-
-        It is reduced by blocks of rows, which depend on the shape of A alone.
-        """
-        columns = self.A.shape[1] + 1
-        most = max(8 * columns, BLOCK // columns)
-
-        def block(start: int) -> Array:
-            part = slice(start, start + most)
-            return reduced_rows(np.column_stack([self.A[part], self.b[part]]))
-
-        blocks = on_all_cores(block, range(0, max(len(self.b), 1), most))
-        return reduce(lambda R, other: reduced_rows(other, R), blocks)
+        """QR factor R (n+1, n+1) of [A b], upper triangular: |A z - b| = |R [z; -1]| for every z."""
+        return reduced_rows(np.column_stack([self.A, self.b]))
 
     @cached_property
     def members(self) -> tuple[np.ndarray, np.ndarray]:
@@ -108,21 +96,13 @@ class LinearModel(Brief):
 
 
 def svd(A: Array) -> tuple[Array, Array, Array]:
-    """Return U, s, V' of A (m, n), of min(m, n) singular values; in less time where its last rows are zero."""
-    k, rows = min(A.shape), int(np.max(np.flatnonzero(A.any(axis=1)), initial=-1)) + 1
-    if rows < k:  # as those of the R of fewer equations than parameters
-        U, (above, s, Vt) = np.eye(len(A), k), np.linalg.svd(A[:rows])
-        U[:rows, :rows] = above
-        return U, np.append(s, np.zeros(k - rows)), Vt[:k]
+    """Return U, s, V' of A (m, n), of min(m, n) singular values."""
     try:
         return np.linalg.svd(A, full_matrices=False)
     except np.linalg.LinAlgError:  # as LAPACK's quicker driver ends with 514 parameters of 80 sessions
         return scipy_svd(A, full_matrices=False, lapack_driver="gesvd")
 
 
-BLOCK = 430_000
-"""Numbers that are reduced together, as many as a processor's cache holds; eight rows a column at least, so that the
-R of the blocks cost little beside them."""
 NARROW, WIDE, MANY = 8, 32, 100
 """Columns that are reduced together where there are few, and from `MANY` on: as is quickest."""
 (GEQRT,) = get_lapack_funcs(("geqrt",), dtype=np.float64)

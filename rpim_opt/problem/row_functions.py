@@ -53,44 +53,33 @@ class Structure(NamedTuple):
     sessions: tuple[str, ...] = ()
 
 
-Kept = dict[tuple[Structure, Measurement], str]
-"""A user's functions as their first return value was, as texts: in another process the function may be another one."""
+Kept = dict[tuple[Structure, Measurement], Functions]
+"""A user's functions as they were built first: what they read may be another value later, or in another process."""
 
 
 def row_functions(structure: Structure, measurement: Measurement, kept: Kept) -> Functions:
     """Return the functions of a row: of ready measurements built once, of a user's as they are, or will be, kept."""
     if measurement in _READY and all(term.ready for term in structure.terms):  # they depend on nothing else
         return _ready(structure, measurement)
+    if (structure, measurement) not in kept:
+        kept[structure, measurement] = _built(structure, measurement)
+    return kept[structure, measurement]
+
+
+def _built(structure: Structure, measurement: Measurement) -> Functions:
     with SYMBOLS:
-        if (structure, measurement) not in kept:
-            inputs, outputs = _expressions(structure, measurement)
-            kept[structure, measurement] = ca.Function("row", inputs, outputs).serialize()
-        return _built(kept[structure, measurement])
+        inputs, (residual, modelled, metres) = _expressions(structure, measurement)
+        # evaluated rows are transposed: the derivative by x stands in rows
+        transposed = ca.densify(-ca.jacobian(residual, inputs[0]).T)
+        return {
+            "residual": ca.Function("residual", inputs, [residual]),
+            "jacobian": ca.Function("jacobian", inputs, [residual, transposed]),
+            "modelled": ca.Function("modelled", inputs, [modelled]),
+            "metres": ca.Function("metres", inputs, [metres]),
+        }
 
 
-@lru_cache(maxsize=MANY)
-def _ready(structure: Structure, measurement: Measurement) -> Functions:
-    with SYMBOLS:
-        return _derived(*_expressions(structure, measurement))
-
-
-@lru_cache(maxsize=MANY)
-def _built(answer: str) -> Functions:
-    function = ca.Function.deserialize(answer)
-    symbols = function.sx_in()
-    return _derived(symbols, list(function.call(symbols)))
-
-
-def _derived(inputs: list[ca.SX], outputs: list[ca.SX]) -> Functions:
-    residual, modelled, metres = outputs
-    # evaluated rows are transposed: the derivative by x stands in rows
-    transposed = ca.densify(-ca.jacobian(residual, inputs[0]).T)
-    return {
-        "residual": ca.Function("residual", inputs, [residual]),
-        "jacobian": ca.Function("jacobian", inputs, [residual, transposed]),
-        "modelled": ca.Function("modelled", inputs, [modelled]),
-        "metres": ca.Function("metres", inputs, [metres]),
-    }
+_ready = lru_cache(maxsize=MANY)(_built)
 
 
 class _Parameters:
@@ -289,12 +278,9 @@ def require_loads(robot: Robot, parameters: Parameters, blocks: Sequence[Block])
 
 def require_same_torques(robot: Robot, parameters: Parameters, before: bool, now: bool) -> None:
     """Refuse other torques than a problem has where compliances need them: gravity's are on guessed masses."""
-    if before == now or not needed(robot, parameters).torques:
-        return
-    if now:
-        accepted = "none, as in the problem's data: its compliances multiply the torques of gravity"
-        raise InputError("compliances", "joint torques", accepted)
-    raise InputError("compliances", "data without joint torques", "columns tau1_Nm, ..., as in the problem's data")
+    if before != now and needed(robot, parameters).torques:
+        accepted = "columns tau1_Nm, ... in all data or in none: torques of gravity are others"
+        raise InputError("compliances", f"data {'with' if now else 'without'} joint torques", accepted)
 
 
 def repeated(block: Block) -> np.ndarray:

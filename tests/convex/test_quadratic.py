@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from rpim_opt.convex.quadratic import Quadratic, Ridge, identity, ridge, robot_alone
-from rpim_opt.problem.linear import LinearModel, svd
+from rpim_opt.problem.linear import LinearModel
 from tests.convex.test_formulation import model
 
 N = 12
@@ -144,19 +143,3 @@ def test_a_flat_penalty_says_as_little_of_the_robot() -> None:
     alone = robot_alone(dense(rank=8), frames)
     assert np.linalg.matrix_rank(alone.matrix) == 8 - frames.sum()
     assert alone.matrix.shape == (8 - frames.sum(), N)
-
-
-def test_rows_of_zeros_are_no_part_of_a_decomposition(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The R of fewer equations than parameters has them: with all rows it takes three times as long."""
-    A = np.zeros((N, N))
-    A[:5] = np.random.default_rng(3).normal(size=(5, N))
-    shapes: list[tuple[int, ...]] = []
-    whole: Any = np.linalg.svd
-    monkeypatch.setattr(np.linalg, "svd", lambda A, **options: (shapes.append(A.shape), whole(A, **options))[1])
-    for rows in (A, A[5:]):
-        U, s, Vt = svd(rows)
-        assert np.allclose((U * s) @ Vt, rows)
-        assert np.allclose(U.T @ U, np.eye(len(s)))
-        assert np.allclose(Vt @ Vt.T, np.eye(len(s)))
-        assert (np.diff(s) <= 0).all()
-    assert shapes == [(5, N), (0, N)]

@@ -268,13 +268,6 @@ def test_no_digit_depends_on_the_number_of_cores(monkeypatch: pytest.MonkeyPatch
         assert np.array_equal(errors, found[0][1])
 
 
-def test_a_triangle_of_many_equations_is_that_of_all() -> None:
-    model = many(9_000).linearize(np.zeros(34))
-    R = model.triangle
-    rows = np.column_stack([model.A, model.b])
-    assert pytest.approx(rows.T @ rows, rel=1e-10, abs=1e-10 * float(np.abs(rows.T @ rows).max())) == R.T @ R
-
-
 def test_functions_of_a_script_are_called_one_after_the_other() -> None:
     whole = ro.load("position").problem
     own = [lambda: whole.data.take(range(20)), lambda: whole.data.take(range(20, 40))]

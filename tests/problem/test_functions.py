@@ -115,20 +115,6 @@ def test_a_frozen_problem_asks_once(way) -> None:
     assert not np.allclose(problem.residual(x), before)
 
 
-def test_the_same_answer_builds_no_second_function() -> None:
-    measurement, change = by_closure()
-    problem = heights(measurement)
-    block = problem.data.blocks[0]
-    first = problem.functions(block)
-    change(1.0)
-    second = problem.functions(block)
-    change(0.0)
-    assert problem.functions(block) is first
-    assert second is not first
-    twin = ro.data.Measurement("height", lambda T: T[2, 3] + 0.0, COLUMNS)
-    assert heights(twin).functions(replace(block, measurement=twin)) is first
-
-
 def test_ready_measurements_are_built_once() -> None:
     problem = ro.load("pose").problem
     block = problem.data.blocks[0]

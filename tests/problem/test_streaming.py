@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration import words
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem import blocks as streaming
 from rpim_opt.problem.blocks import PartitionedProblem, partitions, reduced
@@ -35,13 +34,12 @@ def parameters(robot: ro.robot.Robot) -> ro.robot.Parameters:
     return ro.robot.model_parameters(robot, tools={"": [0.03, -0.02, 0.06, 0, 0, 0]}).identify(chosen)
 
 
-def simulated(robot: ro.robot.Robot, parameters: ro.robot.Parameters, seed: int, blunders: int = 0) -> ro.Dataset:
+def simulated(robot: ro.robot.Robot, parameters: ro.robot.Parameters, seed: int) -> ro.Dataset:
     rng = np.random.default_rng(seed)
     truth = 0.3 * np.random.default_rng(99).normal(size=len(parameters.free)) * parameters.free.scale
     q = rng.uniform(-2, 2, (ROWS, 6))
     y = CalibrationProblem(robot, parameters, ro.Dataset.of(q, np.zeros((ROWS, 3)), 5e-5)).modelled(truth)[0]
     y += 5e-5 * rng.normal(size=y.shape)
-    y[:blunders] += 3e-3
     return ro.Dataset.of(q, y, 5e-5)
 
 
@@ -86,13 +84,6 @@ def test_rows_that_are_reduced_some_at_a_time_say_the_same(name: str, few: int, 
     np.testing.assert_allclose(here.T @ here, gram, rtol=0, atol=1e-12 * np.abs(gram).max())
 
 
-def test_triangles_of_fewer_rows_than_columns() -> None:
-    rows = np.random.default_rng(1).normal(size=(3, 5))
-    R = reduced_rows(rows)
-    assert R.shape == (5, 5)
-    np.testing.assert_allclose(R.T @ R, rows.T @ rows, atol=1e-14)
-
-
 @pytest.fixture(autouse=True)
 def too_many(monkeypatch: pytest.MonkeyPatch) -> None:
     """As with more equations than are kept in memory."""
@@ -135,20 +126,6 @@ def test_bounds_on_parts(whole: CalibrationProblem, parts: list[ro.Dataset]) -> 
     there, here = (ro.calibrate(p, ro.bounded, 1.0) for p in (rows, partitioned(rows, parts)))
     assert there.active_bounds
     np.testing.assert_allclose(here.x, there.x, rtol=0, atol=1e-10)
-
-
-def test_robust_losses_are_reweighted_to_the_same_minimum(whole: CalibrationProblem) -> None:
-    bad = [simulated(whole.robot, whole.parameters, seed, blunders=40) for seed in range(2)]
-    rows = whole.on(ro.Dataset.together(bad, ["a", "b"]))
-    there = ro.calibrate(rows, ro.robust, 1.0)
-    here = ro.calibrate(partitioned(rows, bad), ro.robust, 1.0, max_iterations=200)
-    assert here.converged
-    assert here.formulation is ro.robust
-    assert not any("squared loss" in line for line in words.remarks(here, here.verdict))
-    assert (np.abs(here.x - there.x) / there.problem.parameters.free.scale).max() < 2e-6  # as exact as Clarabel's
-    assert all(b.objective <= a.objective * (1 + 1e-9) for a, b in zip(here.history, here.history[1:], strict=False))
-    squared = ro.calibrate(rows, ro.tikhonov, 1.0)
-    assert np.linalg.norm(squared.x - there.x) > 100 * np.linalg.norm(here.x - there.x)
 
 
 def test_large_problems_are_solved_in_parts_of_whole_configurations(whole, monkeypatch) -> None:
@@ -262,7 +239,7 @@ def test_what_workers_get_holds_no_function_that_they_know(whole: CalibrationPro
     assert functions[0] is jacobian_of(whole)
 
 
-def test_workers_get_a_users_function_as_it_was_asked_and_the_same_with_every_part() -> None:
+def test_workers_get_a_users_function_as_it_was_asked() -> None:
     asked = []
     size = [1.0]
 
@@ -277,9 +254,8 @@ def test_workers_get_a_users_function_as_it_was_asked_and_the_same_with_every_pa
     want = frozen.linearize(0 * ready.parameters.free.nominal)
     count = len(asked)
     size[0] = 2.0
-    first, second = (dict(frozen.frozen_functions) for _ in range(2))
-    there = replace(frozen, frozen_functions=first).linearize(0 * ready.parameters.free.nominal)
+    kept = pickle.loads(pickle.dumps(list(frozen.frozen_functions.values())))
+    there = replace(frozen, frozen_functions=dict(zip(frozen.frozen_functions, kept, strict=True)))
+    there = there.linearize(0 * ready.parameters.free.nominal)
     assert len(asked) == count
     np.testing.assert_array_equal(there.A, want.A)
-    again = replace(frozen, frozen_functions=second)
-    assert jacobian_of(again) is jacobian_of(replace(frozen, frozen_functions=first))
