@@ -647,7 +647,8 @@ def design(
                 limits = measured_ranges(posed)[posed.data.blocks[0].robot].T
                 where = "\nCandidates are within the measured joint ranges (use --table for others)."
             q = ro.problem.random_candidates(replace(posed.robot, limits=limits), candidates, seed)
-        chosen = ro.problem.choose(posed, q, count, criterion, progress=say, measured=posed.data if augment else None)
+        say(f"choosing {count} of {len(q)} candidates")
+        chosen = ro.problem.choose(posed, q, count, criterion, measured=posed.data if augment else None)
     columns = joint_cells(posed.robot, q[chosen.chosen], chosen.chosen)
     label = None if table is None else read_columns(table).get("label")
     if label is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,7 +94,6 @@ def choose(
     candidates: Array,
     count: int,
     criterion: str = "V",
-    progress: Callable[[str], None] = lambda text: None,
     measured: Dataset | None = None,
 ) -> Design:
     """Choose the configurations that are most informative about the identified parameters.
@@ -144,19 +142,9 @@ def choose(
             raise InputError("measured", "touches of points", "a measurement type with independent rows")
         known = problem.on(measured).linearize(np.zeros(len(problem.parameters.free))).A
         prior += known.T @ known
-    progress(f"relaxing over {len(A)} candidates")
-    weights, bound = _relaxed(A, prior, count, criterion, C, progress)
-    progress("rounding")
-    rng, value, chosen = np.random.default_rng(0), -np.inf, np.empty(0, dtype=int)
-    for trial in range(5):  # to the largest weights, then at random by them; the best set stays
-        start = np.argsort(-weights)[:count]
-        if trial:
-            share = np.maximum(weights, 1e-6)
-            start = rng.choice(len(A), count, replace=False, p=share / share.sum())
-        picked = np.sort(_exchanged(A, prior, start, criterion, C))
-        score, _ = _criterion(prior + np.einsum("kin,kim->nm", A[picked], A[picked]), criterion, C)
-        if score > value:
-            value, chosen = score, picked
+    weights, bound = _relaxed(A, prior, count, criterion, C)
+    chosen = np.sort(_exchanged(A, prior, np.argsort(-weights)[:count], criterion, C))
+    value, _ = _criterion(prior + np.einsum("kin,kim->nm", A[chosen], A[chosen]), criterion, C)
     gap = np.exp((bound - value) / n) - 1 if criterion == "D" else max(bound / value, value / bound) - 1
     sign = 1.0 if criterion == "D" else -1.0
     return Design(chosen, weights, criterion, sign * value, sign * bound, float(max(gap, 0.0)))
@@ -188,9 +176,7 @@ def _criterion(M: Array, criterion: str, C: Array) -> tuple[float, Array]:
     return -float(np.sum(inverse * C.T)), inverse @ C @ inverse
 
 
-def _relaxed(
-    A: Array, prior: Array, count: int, criterion: str, C: Array, progress: Callable[[str], None]
-) -> tuple[Array, float]:
+def _relaxed(A: Array, prior: Array, count: int, criterion: str, C: Array) -> tuple[Array, float]:
     """Maximize over {0 <= w <= 1, sum w = count} by multiplicative steps; weights and a bound on the optimum.
 
     The criteria are concave, so that the slope at any weights bounds them all.
@@ -200,7 +186,7 @@ def _relaxed(
     bound = np.inf
     flat = A.reshape(-1, n)
     power = 1.0 if criterion == "D" else 0.5
-    for k in range(MOST_STEPS):
+    for _ in range(MOST_STEPS):
         M = prior + (flat * np.repeat(w, A.shape[1])[:, None]).T @ flat
         value, Z = _criterion(M, criterion, C)
         gain = np.sum((flat @ Z) * flat, axis=1).reshape(len(A), -1).sum(axis=1)
@@ -208,8 +194,6 @@ def _relaxed(
         off = (bound - value) / (n if criterion == "D" else abs(value))
         if off <= 2e-3:
             break
-        if k % 200 == 0:
-            progress(f"relaxing over {len(A)} candidates: within {100 * off:.2f} %")
         # min(1, mu v) with mu such that the sum is count
         v = w * np.maximum(gain, 1e-300) ** power
         order = np.argsort(-v)
