@@ -32,7 +32,7 @@ from rpim_opt.problem.registration.closed_forms import (
     transformed,
     transforms,
 )
-from rpim_opt.problem.registration.points import UNEXPLAINED, Candidates, Points, fit_arms
+from rpim_opt.problem.registration.points import UNEXPLAINED, Points, fit_points
 from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.kinematics import forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.library import find_robot, read_arm
@@ -87,9 +87,9 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         # refuses points on a line
         register(transformed(flange, nominal[number]), y)
         points = Points(robot, q, y, number, nominal, None, np.arange(len(q)))
-        fit = fit_arms(Candidates.of([points]), steps=12)
-        base = fit.base[0]
-        for place, fitted in zip(places.values(), fit.tools[0], strict=True):
+        fit = fit_points(points)
+        base = fit.base
+        for place, fitted in zip(places.values(), fit.tools, strict=True):
             place[:3] = fitted
     else:
         how = f"optimum of the registration {'' if start.certified else 'not '}certified: {start.reason}"

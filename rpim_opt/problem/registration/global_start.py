@@ -15,6 +15,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import joined, three_digits
@@ -118,22 +119,19 @@ class JointMapping:
     @property
     def sentence(self) -> str:
         """Return a sentence on the mapping, its errors and its certainty."""
-        text = (
+        return (
             f"Joint mapping estimated from the data: {described(self.joint_types, self.sign, self.zero)} "
             f"({three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.nominal)} mm; "
             f"{self.starts} random starts: an optimum found by one start in {round(1 / RARE_BASIN)} is missed "
             f"with a probability of {(1 - RARE_BASIN) ** self.starts:.1g})."
         )
-        return " ".join([text, *(each for each in self._said(self.alternatives) if each not in self.ambiguities)])
 
     @property
     def ambiguities(self) -> tuple[str, ...]:
         """Return sentences on alternatives of equal fit; no mirror image of one with stated signs and quarter turns."""
         turning = np.array(self.joint_types) == "revolute"
         as_nominal = bool((self.sign > 0).all() and (self.zero[turning] % QUARTER == 0).all())
-        return self._said([other for other in self.alternatives if not (other.mirror and as_nominal)])
-
-    def _said(self, alternatives: Sequence[Alternative]) -> tuple[str, ...]:
+        alternatives = [other for other in self.alternatives if not (other.mirror and as_nominal)]
         sentences = []
         if self.behind:
             sentences.append(
@@ -379,29 +377,20 @@ class _Mappings:
         return there - there.mean(axis=(0, 1)) if self.points.lengths else there
 
     def robots(self, there: Mapping[int, Array], same: float) -> list[list[int]]:
-        """Return mappings by the robot that they describe, the best first, from what they predict to ``same`` [m].
+        """Return mappings by the robot that they describe, the best first.
 
-        A given one belongs to the first whose best predicts what it does. A plainer one belongs to all of which some
-        mapping predicts the same, or has its signs and zeros near its own: these are one robot then.
+        Two are one robot that predict the same, to ``same`` [m], or of which a plainer one has the signs and nearly the
+        zeros of the other; so are those that a third one connects.
         """
 
-        def alike(i: int, other: int) -> bool:
-            return _apart(there[i], there[other], self.points.lengths) <= same
+        def alike(i: int, k: int) -> bool:
+            turns = np.abs(np.angle(np.exp(1j * (self.zeros[k] - self.zeros[i]))))
+            near = max(i, k) >= self.given and (turns < NEAR_ZERO).all() and (self.sign[k] == self.sign[i]).all()
+            return bool(near) or _apart(there[i], there[k], self.points.lengths) <= same
 
-        def near_zeros(i: int, other: int) -> bool:
-            turns = np.angle(np.exp(1j * (self.zeros[other] - self.zeros[i])))
-            return bool((np.abs(turns) < NEAR_ZERO).all() and (self.sign[other] == self.sign[i]).all())
-
-        groups: list[list[int]] = []
-        for i in there:
-            if i < self.given:
-                of = [group for group in groups if alike(i, group[0])][:1]
-            else:
-                of = [group for group in groups if any(near_zeros(i, j) or alike(i, j) for j in group)]
-            whole = [*(j for group in of for j in group), i]
-            place = next((k for k, group in enumerate(groups) if group in of), len(groups))
-            groups = [*groups[:place], whole, *(group for group in groups[place:] if group not in of)]
-        return groups
+        links = [[alike(i, k) for k in there] for i in there]
+        number = connected_components(np.array(links))[1].tolist()
+        return [[i for i, own in zip(there, number, strict=True) if own == k] for k in dict.fromkeys(number)]
 
     def same(self, robot: Sequence[int]) -> tuple[Alternative, ...]:
         """Return other descriptions of a robot that change as few joints as its plainest."""
