@@ -458,7 +458,7 @@ class Parsed:
                     raise self._wrong(f"place '{name}'", choices(name, [*known, WORKSPACE]))
                 numbers = np.array(known[name].numbers) if name in known else None
                 if numbers is None or known[name].is_box:
-                    numbers = bounding(problem_of(p), numbers, p.farthest)
+                    numbers = bounding(problem_of(p), numbers, p.at)
                 q.append(numbers)
             movement = every_movement(p, np.concatenate(q))
             size = np.linalg.norm(movement.slope, axis=(1, 2))

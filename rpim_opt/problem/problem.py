@@ -570,20 +570,19 @@ class CalibrationProblem(RobotModel):
 class Identified(Parameters):
     """The n identified parameters of a linear model, with the problem that positions are predicted from.
 
-    These are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is requested, also those
-    that move farthest at the deviations ``farthest`` (n,) [SI] are looked at.
+    These are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is requested, those that
+    move farthest there are looked at.
     """
 
     problem: CalibrationProblem | None = None
     at: Array | None = None
-    farthest: Array | None = None
 
 
 def around(model: LinearModel, x: Array | None) -> LinearModel:
-    """Return a model that predicts positions linearly about x (n,) [SI], where regions are looked at, too."""
+    """Return a model that predicts positions linearly about x (n,) [SI]."""
     if x is None or not isinstance(model.parameters, Identified):
         return model
-    return replace(model, parameters=replace(model.parameters, at=x, farthest=x))
+    return replace(model, parameters=replace(model.parameters, at=x))
 
 
 def error_dimensions(block: Block) -> list[str]:

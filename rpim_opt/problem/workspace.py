@@ -91,14 +91,14 @@ def within(problem: CalibrationProblem, box: Array | None = None, marker: str | 
     return _in_box(problem, tuple(map(tuple, box.tolist())), marker)
 
 
-def bounding(problem: CalibrationProblem, box: Array | None, farthest: Array | None) -> Array:
-    """Return some of `within` and those of largest displacement, so that bounds hold in the whole region."""
+def bounding(problem: CalibrationProblem, box: Array | None, x: Array | None) -> Array:
+    """Return some of `within` and those that move farthest at x (n,) [SI], so that bounds hold in the whole region."""
     q = within(problem, box)
-    if farthest is None or len(q) <= 2 * SOME:
+    if x is None or len(q) <= 2 * SOME:
         return q[: 2 * SOME]
     own = ~problem.parameters.free.of_frames
     here = problem.measuring(q[SOME:])
-    movement = here.modelled(farthest * own)[0] - here.modelled(np.zeros(len(own)))[0]
+    movement = here.modelled(x * own)[0] - here.modelled(np.zeros(len(own)))[0]
     order = np.argsort(-np.linalg.norm(movement, axis=1), kind="stable")[:SOME]
     return np.concatenate([q[:SOME], q[SOME:][order]])
 
