@@ -109,15 +109,6 @@ def test_rows_that_do_not_belong_together_are_named() -> None:
     assert "do the rows of the two tables match?" in text
 
 
-def test_a_lost_decimal_point_is_named() -> None:
-    problem, _ = simulated(("theta2",), 30)
-    block = problem.data.blocks[0]
-    far = np.where(np.arange(30)[:, None] == 4, 1e3 * block.y, block.y)
-    data = replace(problem.data, blocks=(replace(block, y=far),))
-    (text,) = rows_without_values(data, problem.arms)
-    assert text.startswith(f"row {problem.labels[4]} is farther from the others than the arm is long")
-
-
 def test_travel_of_a_rail_is_reach() -> None:
     robot = ro.robot.Robot("rail", np.zeros((1, 5)), joint_types=("prismatic",))
     q = np.append(np.linspace(0, 0.5, 20), 8.0)[:, None]

@@ -10,7 +10,6 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration import inspect
 from rpim_opt.problem.diagnosis import odd_column, other_places
-from rpim_opt.robot.library import find_robot
 from tests.test_cli import run
 
 CLEAN = ("position", "pose", "markers", "cable", "distance", "mixed", "seven_axis", "tracker", "scara", "paper_arm")
@@ -48,17 +47,6 @@ def test_likely_mistakes_are_named(mistake: str) -> None:
     name, change, expected = MISTAKES[mistake]
     said = inspect(changed(name, **change)).judgement
     assert any(expected in text and "times better" in text for text in said), said
-
-
-def test_a_ready_robot_of_nearly_the_same_drawing_is_named() -> None:
-    problem = ro.load("mixed").problem
-    assert problem.robot.name.endswith("UR10e")
-    older = ro.read_robot(find_robot("ur10"))
-    nominal = problem.parameters.nominal.copy()
-    nominal[: older.mdh.size] = older.mdh.ravel()
-    stated = replace(problem, robots=older, parameters=replace(problem.parameters, nominal=nominal))
-    (text,) = [each for each in inspect(stated).judgement if "times better" in each]
-    assert "the ready robot ur10e" in text
 
 
 def test_the_row_from_which_on_the_base_stood_elsewhere_is_named() -> None:
@@ -139,11 +127,3 @@ def test_the_command(monkeypatch, capsys) -> None:
         "noise (1 sigma)",
     ):
         assert part in out
-
-
-def test_simulate_and_robots_commands(monkeypatch, capsys, tmp_path) -> None:
-    assert run(monkeypatch, "simulate", "position", "--seed", "5", "--out", str(tmp_path)) == 0
-    assert (tmp_path / "truth.toml").read_text().startswith("# made by: rpim-opt simulate position")
-    assert run(monkeypatch, "robots") == 0
-    assert "Universal Robots UR5e" in capsys.readouterr().out
-    assert run(monkeypatch, "simulate", "paper_arm") == 2
