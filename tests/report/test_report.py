@@ -101,7 +101,7 @@ def test_the_report_says_the_figures_of_the_result(arm, arm_page) -> None:
     )
     assert "Unidentifiable: theta6." in text
     assert "T8-6" in text  # left out, with its reason
-    assert "validation, position 16 0.03 mm (x, y, z)" in text  # of one covariance for all rows
+    assert "validation, position160.03 mm (x, y, z)" in text  # cells: 16 rows, of one covariance
     assert re.search(r"Held-out rows: \d+ % of the coordinates are within", text)
     for digest in arm.record.files.values():
         assert digest in text
