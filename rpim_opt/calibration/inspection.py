@@ -41,7 +41,7 @@ class Inspection(Tabled):
     >>> import rpim_opt as ro
     >>> found = ro.calibration.inspect(ro.load("paper_arm", variant="misprints").problem)
     >>> [row.label for row in found.outliers], found.observability.rank, found.warnings
-    (['T8-6', 'T8-7'], 20, ())
+    (['T8-6', 'T8-7'], 20, ('the axes 2 and 3 are nearly parallel: add beta2 to `identify`.',))
     """
 
     problem: CalibrationProblem
