@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain, combinations, pairwise, product
+from itertools import chain, combinations, combinations_with_replacement, pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -736,15 +736,15 @@ def _without_parameters(model: LinearModel) -> Callable[[Array], Array]:
 
 
 def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | None = None) -> Iterator[str]:
-    """Report what one addition to the linearization at x (n,) explains best: what moved or is scaled.
+    """Report what one addition to the linearization at x (n,) explains best: what moved, lags or is scaled.
 
     Added are the columns of a base, fixture, reflector or joint zero for the rows from one on, or between two of a few,
     of a joint zero from a value of the joint on as well, and of a reflector by the direction of gravity at the flange;
-    the slope of a joint's zero times the value of a joint, and the slopes of the scale or offset of lengths, of
-    positions by the scales of their axes, too. Else backlash, rows of two kinds, noise of one column and of some rows
-    are looked for. Nothing is reported where gravity and eccentric gears explain more, which are not in the model: a
-    lack of fit, and no mistake. With ``most`` the addition is reported if it leaves at most that part of the squares,
-    and nothing else is looked for.
+    the slope of a joint's zero times the value of a joint, all of these times the way from the row before, and the
+    slopes of the scale or offset of lengths, of positions by the scales and skews of their axes, too. Else backlash,
+    rows of two kinds, noise of one column and of some rows are looked for. Nothing is reported where gravity and
+    eccentric gears explain more, which are not in the model: a lack of fit, and no mistake. With ``most`` the addition
+    is reported if it leaves at most that part of the squares, and nothing else is looked for.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
@@ -1066,7 +1066,7 @@ def _zeros(robot: Robot) -> list[str]:
 
 
 def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition]:
-    """Yield every gear ratio and coupling."""
+    """Yield every gear ratio and coupling, and a lag of all joints."""
     robot, free = problem.robot, problem.parameters.free
     slopes = model.A / free.scale
     q = problem.joint_values
@@ -1086,10 +1086,15 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
     for i, j in product(of_zero, range(q.shape[1])):
         if q[:, j].any():
             yield Addition((of_zero[i] * q[problem.owners, j])[:, None], partial(gear, i, j))
+    if len(of_zero) == len(robot.mdh):
+        way = np.diff(q, axis=0, prepend=q[:1])[problem.owners]
+        lag = np.sum([zero * way[:, i] for i, zero in of_zero.items()], axis=0)
+        remedy = "read both when the arm stands still"
+        yield Addition(lag[:, None], lambda c: (f"joint values lag behind by {100 * c[0]:.2g} % of each move", remedy))
 
 
 def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterator[Addition]:
-    """Yield the scale and the offset of lengths, and of positions the scales of their axes, too."""
+    """Yield the scale and the offset of lengths, and of positions the scales and skews of their axes."""
     free = problem.parameters.free
     base = [free.names.index(f"base_{c}") for c in "xyz" if f"base_{c}" in free.names]
     y = np.zeros((len(problem.data), 3))
@@ -1109,16 +1114,15 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         radial = y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
         along += np.column_stack([np.sum(of_axis * y, axis=1), np.sum(of_axis * radial, axis=1)])
 
-    def scaled(column: Array, what: str, of: str) -> Addition:
+    def scaled(column: Array, what: str, remedy: str, of: str = "too long") -> Addition:
         # a scale that shrinks positions to half and less fits values that have nothing to do with the robot
-        remedy = f"check the scale of the {of}"
-        return Addition(column[:, None], lambda c: (f"{what} {100 * c[0]:+.2g} % too long", remedy), most=0.5)
+        return Addition(column[:, None], lambda c: (f"{what} {100 * c[0]:+.2g} % {of}", remedy), most=0.5)
 
     def longer(share: Array | float, when: str, remedy: str) -> Addition:
         said = "{}measured distances are {} mm too long".format
         return Addition((along[:, 1] * share)[:, None], lambda c: (said(when, three_digits(1e3 * c[0])), remedy))
 
-    yield scaled(along[:, 0], "measured lengths are", "instrument")
+    yield scaled(along[:, 0], "measured lengths are", "check the scale of the instrument")
     yield longer(1.0, "", "check the instrument's zero and the reflector's radius")
     for when, share in _shares(problem).items():
         yield longer(share, f"{when} ", "check the reflector and its radius in these rows")
@@ -1138,5 +1142,9 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         lens = "calibrate its lens or its refraction, or measure nearer to its axis"
         distorted = "measured positions are distorted with the cube of their distance from their middle"
         yield Addition(cubic[:, None], lambda c: (distorted, lens))
-        for i, axis in enumerate("xyz"):
-            yield scaled(of_axis[:, i] * y[:, i], f"column {axis} is", "column")
+    for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
+        what = (f"column {'xyz'[i]} is", "check its scale")
+        if i != j:
+            axes = "check whether the instrument's axes are square"
+            what = (f"column {'xyz'[i]} contains", axes, f"of column {'xyz'[j]}")
+        yield scaled(of_axis[:, i] * y[:, j], *what)

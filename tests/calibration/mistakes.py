@@ -349,6 +349,14 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
         of_joint(2, lambda q: q + 3.5e-3 * np.random.default_rng(4).choice([-1, 1], COUNT)),
         "backlash, joint 3 by 7 mrad",
     ),
+    "joint values read on the way": (
+        joints(lambda q: q - 2e-3 * np.diff(q, axis=0, prepend=q[:1])),
+        "joint values lag behind by 0.2 % of each move",
+    ),
+    "axes that are not square": (
+        values(lambda y: y + 2e-3 * np.outer(y[:, 1], [1, 0, 0])),
+        "of column y (that leaves",
+    ),
     "joints rounded to 0.1 degrees": (rounded(0.1), "rounded to 0.1 deg ("),
     "joints rounded to a degree": (rounded(1.0), "rounded to 1 deg ("),
 }

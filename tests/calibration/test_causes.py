@@ -64,6 +64,8 @@ QUICK = {
         "mirrored, and joint 1 reversed",
         "inches, joint 2 from 90 degrees and joint 3 reversed",
         "signs of x lost",
+        "joint values read on the way",
+        "axes that are not square",
         "the floor heaves",
         "azimuths and elevations exchanged",
         "a lens",
