@@ -377,6 +377,8 @@ def _factors(points: Points) -> Iterator[Misreading]:
             near = (factor * ratio ** np.linspace(-1, 1, 9)).tolist()
             factor = near[int(np.argmin(misfits([times(what, each, few) for each in near])))]
             ratio **= 0.25
+        unit = min((*LENGTHS, *ANGLES), key=lambda each: abs(np.log(each / factor)))
+        factor = unit if abs(factor / unit - 1) < 1e-3 else factor  # the nominal robot is not more exact
         remedy = f"multiply {what} by {factor:.5g}, or name the unit"
         if what == LENGTHS_OF_ALL:
             remedy += ", or state the right robot: another one's size explains the same"

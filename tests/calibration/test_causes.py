@@ -270,11 +270,12 @@ def braced(change):
         ("iiwa7", NEARER, "from row P4. on measured distances are -12"),
         ("iiwa7", braced(NEARER), "from row {P4.} on measured distances are -12"),
         ("ur5e", of_joint(0, lambda q: (q + np.pi / 2) % np.pi - np.pi / 2), "wrong values of joint 1"),
+        ("ur5e", of_joint(2, lambda q: 10 * q), r"multiply values of joint 3 by 0\.1, or name the unit"),
     ],
     ids=[
         "rows in metres", "a sign in some rows", "mixed units", "joint 7 third", "joints in reverse", "three stations",
         "two operators", "a new radius", "labels in braces",
-        "half a turn",
+        "half a turn", "tenths of a degree",
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_some_rows_or_one_place_is_named(robot: str, wrong, said: str) -> None:
