@@ -136,12 +136,15 @@ def single_rows(problem: CalibrationProblem) -> Iterator[str]:
 
 
 def rows_without_values(data: Dataset, arms: Mapping[str, Robot]) -> Iterator[str]:
-    """Report rows with zeros or one number for all measured coordinates, which instruments write for missing values."""
+    """Report equal columns, and rows with one number for all coordinates: instruments write it for missing values."""
     for block in data.blocks:
         if len(block.measurement.columns) < 3:
             continue
         y = block.y[:, :3]
         same = (y == y[:, :1]).all(axis=1)
+        for i, j in combinations(range(3), 2):
+            if not same.all() and (y[:, i] == y[:, j]).all():
+                yield f"columns {'xyz'[i]} and {'xyz'[j]} are equal in every row: is one a copy? Export both again."
         for value in np.unique(y[same, 0]):
             unit, si = display("length")
             number = f"{value / si:g} {unit}" if value else "0"

@@ -205,7 +205,9 @@ def _joints(what: str, remedy: str, M: Array) -> Misreading:
 def _of_positions() -> Iterator[Misreading]:
     """Yield readings with other measured positions: units of all columns or one, handedness."""
     for factor, (unit, remedy) in LENGTHS.items():
-        yield _scaled(f"measured lengths {unit}", remedy, factor)
+        yield _scaled(
+            f"measured lengths {unit}", f"{remedy}; or correct the robot's file, if its unit is wrong", factor
+        )
         for axis, of_axis in zip("xyz", np.eye(3), strict=True):
             remedy = f"multiply column {axis} by {factor:g} or name its unit"
             yield _scaled(f"column {axis} {unit}", remedy, 1 + (factor - 1) * of_axis)

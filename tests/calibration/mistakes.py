@@ -263,7 +263,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
         values(lambda y: np.abs(y - y.mean(axis=0))),
         "no value of column x, y and z is negative",
     ),
-    "y a copy of x": (values(lambda y: y[:, [0, 0, 2]]), "the values of coordinate"),
+    "y a copy of x": (values(lambda y: y[:, [0, 0, 2]]), "columns x and y are equal in every row"),
     "z a column of RMS": (
         values(lambda y: np.column_stack([y[:, :2], 2e-5 * np.random.default_rng(3).chisquare(3, len(y))])),
         "the values of coordinate z explain nothing",

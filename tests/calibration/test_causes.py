@@ -66,6 +66,7 @@ QUICK = {
         "signs of x lost",
         "joint values read on the way",
         "axes that are not square",
+        "y a copy of x",
         "the floor heaves",
         "azimuths and elevations exchanged",
         "a lens",
