@@ -439,20 +439,29 @@ class ReducedProgram:
         if self.rows and not near.any():
             rows = np.vstack([squares.R, np.sqrt(weight + CENTRED * np.sum(squares.R**2)) * np.eye(n)])
             near[p.at] = np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0]
-        found = self._about(near, squares, weight, A, b)
-        if (p.missed(found.x) > ACCEPTED or np.abs(found.x).max() > FAR) and not len(p.shared):
-            missed, there = max(FEASIBLE, p.missed(found.x)), found.x
-            for _ in range(REFINEMENTS):
-                try:
-                    refined = self._refined(there, squares, weight, A, b)
-                except Unsolved:
-                    break
-                there = refined.x
-                if p.missed(there) <= max(missed, SOUGHT * np.abs(there).max()):
-                    found = refined
-                    break
+        far = np.abs(near).max() > FAR and not len(p.shared)
+        found = self._nearby(near, FEASIBLE, squares, weight, A, b) if far else None
+        if found is None:
+            found = self._about(near, squares, weight, A, b)
+            missed = p.missed(found.x)
+            if (missed > ACCEPTED or np.abs(found.x).max() > FAR) and not len(p.shared):
+                found = self._nearby(found.x, max(FEASIBLE, missed), squares, weight, A, b) or found
         self.near = found.x
         return found
+
+    def _nearby(
+        self, near: Array, missed: float, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
+    ) -> Point | None:
+        """Return the minimum refined from a point (N,); None where it misses constraints by more, or is not solved."""
+        for _ in range(REFINEMENTS):
+            try:
+                point = self._refined(near, squares, weight, A, b)
+            except Unsolved:
+                return None
+            near = point.x
+            if self.canonical.missed(near) <= max(missed, SOUGHT * np.abs(near).max()):
+                return point
+        return None
 
     def _refined(self, near: Array, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None) -> Point:
         """Return the minimum next to one (N,), in changes of unit size: z = z0 + V min(1 / s, far) y, others far y.
