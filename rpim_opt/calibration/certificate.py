@@ -11,7 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import TINY, Array
 from rpim_opt.basics.exceptions import NoSolutionFound
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.program import Program, feasibility_tolerance, pose
+from rpim_opt.convex.program import feasibility_tolerance, pose
 from rpim_opt.problem.linear import LinearModel
 
 DECREASE = 1e-6  # what the program at a solution may still promise of the objective: an interior point's accuracy
@@ -53,19 +53,16 @@ def certified(
     weight: float,
     floor: float = 0.0,
     residual: Callable[[Array], Array] | None = None,
-    before: Program | None = None,
 ) -> Certificate:
     """Return the certificate that z (n,) minimizes the nonlinear problem; the formulation's functions are called anew.
 
     ``model`` is the problem linearized at z, anew; ``floor`` the objective below which one has vanished. Where
     ``residual`` gives the whitened residual b - A z at z (n,), the model's derivative is compared with its differences,
-    and replaced by them where it is not theirs. What CVXPY made of the functions of the program ``before`` serves again
-    where they answer the same.
+    and replaced by them where it is not theirs.
     """
     if residual is not None:
         model = _differentiated(model, residual, z)
-    # where a minimum is looked for first proves nothing
-    program = (before or pose(formulation, model)).anew(formulation, model, z)
+    program = pose(formulation, model).beginning(z)  # where a minimum is looked for first proves nothing
     objective = program.objective(z, weight)
     violation = program.violation(z)
     try:

@@ -513,7 +513,7 @@ def _certified(loop: Loop, problem: Source, state: State) -> Ended:
         if isinstance(anew, CalibrationProblem):
             residual = lambda z: anew.whitened_residual(loop.scale * z)  # noqa: E731
         model = around(anew.linearize(loop.scale * state.z), loop.about)
-    certificate = certified(loop.solved, model, state.z, state.choice.weight, state.floor, residual, state.program)
+    certificate = certified(loop.solved, model, state.z, state.choice.weight, state.floor, residual)
     return Ended(state, loop.scale * state.z, certificate)
 
 

@@ -6,7 +6,7 @@ import contextlib
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
@@ -106,7 +106,8 @@ def listed(value: Any, where: str) -> list[Any]:
 
 
 def _require_numbers(stated: Any, where: str) -> None:
-    if any(np.isnan(part).any() for constant in stated.constants() for part in _numbers(constant)):
+    numbers = [each.value.data if scipy.sparse.issparse(each.value) else each.value for each in stated.constants()]
+    if any(np.isnan(each).any() for each in numbers):
         raise InputError(where, "a constant that is not a number (NaN)", "numbers, or infinity as a bound")
 
 
@@ -146,37 +147,6 @@ def substituted(stated: Any, instead: Mapping[int, Any]) -> Any:
     if kind.__name__ == "SuppFuncAtom":
         return kind(args[0], stated._parent)
     return stated.copy(args, instead)
-
-
-def fingerprint(stated: Any, order: dict[int, int]) -> Any:
-    """Return what expressions or constraints are made of, hashable; ``order`` numbers their variables as they come."""
-    if isinstance(stated, list | tuple):
-        return tuple(fingerprint(each, order) for each in stated)
-    if isinstance(stated, np.ndarray):
-        return stated.shape, stated.dtype.str, stated.tobytes()
-    if not issubclass(type(stated), cp.Expression | cp.Constraint):
-        return stated if isinstance(stated, Hashable) else repr(stated)  # slices
-    data: Any = stated.get_data() or []
-    if isinstance(stated, cp.Variable):
-        data = [order.setdefault(id(stated), len(order)), *stated.attributes.items()]
-    elif isinstance(stated, cp.Constant):
-        data = _numbers(stated)
-    elif isinstance(stated, cp.Constraint):  # whose number is another one at every call
-        data = [each for each in data if each is not stated.constr_id]
-    elif type(stated).__name__ == "perspective":
-        data = [stated.f, stated.f_recession]
-    elif type(stated).__name__ == "SuppFuncAtom":
-        data = [stated._parent]
-    return type(stated), stated.shape, fingerprint(data, order), fingerprint(stated.args, order)
-
-
-def _numbers(constant: Any) -> list[Array]:
-    """Return the numbers of a constant, and where they stand in a sparse one."""
-    value = constant.value
-    if not scipy.sparse.issparse(value):
-        return [np.asarray(value)]
-    value = scipy.sparse.coo_array(value)
-    return [value.data, *value.coords]
 
 
 class Frozen:

@@ -127,14 +127,6 @@ class Program(Brief):
         """Return the program for another model of the same shape, without calling the functions anew."""
         return Program(self.formulation, model, self.structure, self._warm)
 
-    def anew(self, formulation: Formulation, model: LinearModel, z: Array) -> Program:
-        """Return the program with the formulation's functions called anew, warm-started at z (n,).
-
-        Where they return what they returned to this program, its canonical forms and last minimum serve again.
-        """
-        again = pose(formulation, model)
-        return self.on(model) if again.structure is self.structure else again.beginning(z)
-
     def on_squares(self, model: LinearModel) -> Program:
         """Return the same penalty and constraints with the squares of other equations as the loss."""
         return self._part(self.structure.on_squares, model)

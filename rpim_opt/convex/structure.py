@@ -1,14 +1,14 @@
 """Expressions of a formulation for data of one shape, and the structure that selects the solver.
 
-A user's functions are called whenever a program is posed (`pose`), never by `Program.on`; where they return what they
-returned before, the structure of that serves again. Besides these a loss is called by `expressions.term` where its
-values or slopes are needed at numbers: for blocks of rows, for what a robust loss keeps, for a loss of a QR factor.
+A user's functions are called whenever a program is posed (`pose`), never by `Program.on`. Besides these a loss is
+called by `expressions.term` where its values or slopes are needed at numbers: for blocks of rows, for what a robust
+loss keeps, for a loss of a QR factor.
 
 CVXPY canonicalizes penalty and constraints once for a `Structure` (`canonical`), a loss once where Clarabel takes all
 of its rows (`Loss.canonical`), and some entries of a nonsmooth loss anew for every working set (`Loss.some`); besides,
 a quadratic of a user's is recognized by a canonical form, and the last resort (`Program.solve`) is canonicalized anew.
-Programs keep their structure, and `MOST_KEPT` are kept for the next ones, then all are forgotten. Warm starts and
-Clarabel's solvers live as long as the programs that `Program.on` makes of one another.
+Programs keep their structure, and `MOST_KEPT` of ready formulations are kept for the next ones, then all are
+forgotten. Warm starts and Clarabel's solvers live as long as the programs that `Program.on` makes of one another.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from rpim_opt.convex.expressions import (
     Term,
     called,
     cp,
-    fingerprint,
     listed,
     minimized,
     norms,
@@ -231,13 +230,6 @@ class Structure:
         made._called = copy.copy(self._called)
         return made
 
-    @property
-    def fingerprint(self) -> Any:
-        """What the functions returned, hashable."""
-        a = self.expressions
-        stated = [a.z, a.loss.variable, a.loss.expression, a.penalty_of_z, a.constraints, a.differences, a.predicts]
-        return fingerprint(stated, {})
-
     # --- structure ---------------------------------------------------------------------------------------------
 
     @cached_property
@@ -395,26 +387,22 @@ def structure(
     if formulation.loss in INVARIANT and formulation.loss_over == "equation":
         m = n + 1
     p, groups = model.parameters, model.members[0]
-    key: tuple[Any, ...] = (n, m, groups.tobytes() if formulation.loss_over == "configuration" else b"")
-    made = None
-    if formulation.ready:
-        key = (formulation, *key)
-    else:  # its functions may return another thing at every call
-        made = Structure(formulation, p, m, groups)
-        key = (id(formulation), made.fingerprint, *key)
+    if not formulation.ready:  # its functions may return another thing at every call
+        return Structure(formulation, p, m, groups)
+    key: tuple[Any, ...] = (formulation, n, m, groups.tobytes() if formulation.loss_over == "configuration" else b"")
     if formulation.constraints or formulation.penalty_over is not None:  # which see the parameters
         key = (*key, p.names, p.dimensions, p.nominal.tobytes(), p.scale.tobytes(), p.tolerance.tobytes())
     found = _KEPT.get(key)  # another thread may clear them
     if found is None:
         if len(_KEPT) >= MOST_KEPT:
             _KEPT.clear()
-        found = _KEPT[key] = made or Structure(formulation, p, m, groups)
+        found = _KEPT[key] = Structure(formulation, p, m, groups)
     return found
 
 
 _KEPT: dict[Any, Structure] = {}
 MOST_KEPT = 64
-"""Structures that are kept for the next model of their shape, and functions that return the same again."""
+"""Structures of ready formulations that are kept for the next model of their shape."""
 
 
 def of_length(formulation: Formulation, equations: Callable[[], int]) -> Formulation | None:

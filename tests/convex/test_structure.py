@@ -288,19 +288,3 @@ def test_least_squares_does_not_claim_positions_that_the_data_do_not_know() -> N
     assert result.predict(q).standard.max() < 1e-4
     elsewhere = result.predict(arm.data.q[:5])
     assert not np.isfinite(elsewhere.standard).any(axis=1).all()
-
-
-def test_functions_that_return_the_same_have_one_structure() -> None:
-    limit: list[Any] = [1.0]
-    problem = ro.load("position").problem
-    model = problem.linearize(np.zeros(len(problem.parameters.free)))
-
-    def within(z: Any, _: Any) -> list[Any]:
-        slack = cp.Variable(z.size, nonneg=True)
-        return [z <= limit[0] + slack, cp.sum(slack) <= 1]
-
-    mine = ro.Formulation("mine", lambda r: cp.sum(cp.huber(r, limit[0])), cp.norm1, (within,))
-    first, again = ro.convex.pose(mine, model).structure, ro.convex.pose(mine, model).structure
-    limit[0] = 1.5
-    assert again is first
-    assert ro.convex.pose(mine, model).structure is not first
