@@ -96,10 +96,9 @@ def test_unknown_words_are_refused(word: str, value: str) -> None:
         ro.calibrate(POSITION, **{word: value})
 
 
-@pytest.mark.parametrize(("start", "found"), [([0.0], "shape"), (np.full(34, np.nan), "not finite"), ("here", "str")])
-def test_a_start_that_does_not_fit_is_refused(start: object, found: str) -> None:
-    with pytest.raises(ro.InputError, match=f"start: found .*{found}"):
-        ro.calibrate(POSITION, start=start)
+def test_a_start_that_is_no_array_is_refused() -> None:
+    with pytest.raises(ro.InputError, match=r"start.*: found .*str"):
+        ro.calibrate(POSITION, start="here")
 
 
 def test_data_that_are_no_numbers_are_refused() -> None:

@@ -104,8 +104,8 @@ def test_a_start_that_does_not_fit_is_refused(start: np.ndarray) -> None:
 @pytest.mark.parametrize("part", ["A", "b"])
 def test_data_that_are_not_finite_are_refused(part: str) -> None:
     class Broken(Loop):
-        def linearized(self, z: np.ndarray, before: np.ndarray | None = None) -> Any:
-            model = super().linearized(z, before)
+        def linearized(self, z: np.ndarray) -> Any:
+            model = super().linearized(z)
             return replace(model, **{part: np.nan * getattr(model, part)})
 
     at = loop()
