@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -56,6 +56,7 @@ class Simulation(Table):
     blunders: int = Field(default=0, ge=0)
     blunder: Length = 0.0
     markers: dict[str, list[str]] = Field(default_factory=dict)
+    torques: Literal["measured", "gravity"] = "measured"
     points_mm: dict[str, Place] = Field(default_factory=dict)
     validation_points_mm: dict[str, Place] = Field(default_factory=dict)
     planes: dict[str, PlaneTable] = Field(default_factory=dict)
@@ -188,7 +189,7 @@ class _Table:
         columns, rows = self._labelled(count)
         q = np.array([[random[k], random[count + k]][: kind.points] for k in rows])
         torque = None
-        if any(name.startswith("compliance") for name in self.parameters.free.names):
+        if self.plan.torques == "measured" and any(n.startswith("compliance") for n in self.parameters.free.names):
             torque = self.rng.uniform(-TORQUE, TORQUE, q.shape).round(3)
         constraint = not kind.columns
         columns |= self._joints(q, EXACT_DIGITS if constraint else DIGITS, torque)
