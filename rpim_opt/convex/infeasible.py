@@ -30,75 +30,65 @@ def conflict(structure: Structure) -> Conflict | None:
     slacks, of one kind at a time.
     """
     z = cp.Variable(structure.n)
-    units = _units(structure, z)
-    if _possible(units):
+    conditions = _conditions(structure, z)
+    if _possible(conditions):
         return None
-    units_left = _irreducible(units)
-    single = _irreducible([[statement] for unit in units_left for statement in unit])
-    names = tuple(statement.name for unit in single for statement in unit)
+    left = list(conditions)
+    for condition in conditions:  # leave out, one after the other, what is not needed for the contradiction
+        others = [other for other in left if other is not condition]
+        if not _possible(others):
+            left = others
     parameters = structure.parameters
     parsed = [function for function in structure.formulation.constraints if isinstance(function, Parsed)]
     slacks = []
     for kind, count in (("boxes", structure.n), ("statements", len(parsed))):
         slack = cp.Variable(max(count, 1), nonneg=True)
-        minimized(cp.Problem(cp.Minimize(cp.sum(slack)), _demands(_units(structure, z, **{kind: slack}))))
+        minimized(cp.Problem(cp.Minimize(cp.sum(slack)), _demands(_conditions(structure, z, **{kind: slack}))))
         slacks.append(np.zeros(count) if slack.value is None else np.asarray(slack.value)[:count])
     by_box, by_statement = slacks
     bounds = {parameters.names[i]: float(by_box[i] * parameters.scale[i]) for i in np.flatnonzero(by_box > LEAST)}
     pairs = zip(parsed, by_statement, strict=True)
     statements = {each.name: float(each.scale(parameters) * by) for each, by in pairs if by > LEAST}
-    return Conflict(bounds, names, statements)
+    return Conflict(bounds, tuple(condition.name for condition in left), statements)
 
 
-def _demands(units: list[list[Condition]]) -> list[Any]:
-    return [demand for unit in units for stated in unit for demand in stated.demands]
+def _demands(conditions: list[Condition]) -> list[Any]:
+    return [demand for condition in conditions for demand in condition.demands]
 
 
-def _possible(units: list[list[Condition]]) -> bool:
+def _possible(conditions: list[Condition]) -> bool:
     """Whether all can be met at once."""
-    problem = cp.Problem(cp.Minimize(0), _demands(units))
+    problem = cp.Problem(cp.Minimize(0), _demands(conditions))
     return minimized(problem) or problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
 
 
-def _irreducible(units: list[list[Condition]]) -> list[list[Condition]]:
-    """Leave out, one after the other, what is not needed for the contradiction."""
-    left = list(units)
-    for unit in units:
-        others = [other for other in left if other is not unit]
-        if not _possible(others):
-            left = others
-    return left
-
-
-def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any = 0) -> list[list[Condition]]:
+def _conditions(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any = 0) -> list[Condition]:
     """Return what every constraint function demands, bound by bound.
 
     Loosened by slacks of boxes [scales], and of statements in words [scales of each].
     """
     parameters, stated = structure.parameters, structure.formulation
-    units: list[list[Condition]] = []
+    made: list[Condition] = []
     count = 0
     for k, function in enumerate(stated.constraints):
-        unit: list[Condition] = []
         if isinstance(function, Box):
             more = boxes + np.zeros(structure.n)
             for sign, side in zip("><", function.bounds(parameters), strict=True):
                 for i in np.flatnonzero(np.isfinite(side)):
                     bound = as_text(side[i] * parameters.scale[i], parameters.dimensions[i])
                     demand = z[i] >= side[i] - more[i] if sign == ">" else z[i] <= side[i] + more[i]
-                    unit.append(Condition(f"{parameters.names[i]} {sign}= {bound} ({function.name})", (demand,)))
+                    made.append(Condition(f"{parameters.names[i]} {sign}= {bound} ({function.name})", (demand,)))
         elif isinstance(function, Parsed):
             by = None if isinstance(statements, int) else function.scale(parameters) * statements[count]
-            unit.append(Condition(function.name, tuple(function.loosened(z, parameters, by))))
+            made.append(Condition(function.name, tuple(function.loosened(z, parameters, by))))
             count += 1
         else:
             own = structure.expressions
             demands = [substituted(constraint, {id(own.z): z}) for constraint in own.constraints[k]]
             name = name_of(function, k)
             several = len(demands) > 1
-            unit = [Condition(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
-        units.append(unit)
-    return units
+            made += [Condition(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
+    return made
 
 
 def advice(structure: Structure, status: str, found: Conflict | None) -> str:

@@ -1,8 +1,8 @@
 """Expressions of a formulation for data of one shape, and the structure that selects the solver.
 
 A user's functions are called whenever a program is posed (`pose`), never by `Program.on`. Besides these a loss is
-called by `expressions.term` where its values or slopes are needed at numbers: for blocks of rows, for what a robust
-loss keeps, for a loss of a QR factor.
+called by `expressions.term` where its values or slopes are needed at numbers: for blocks of rows, and for what a
+robust loss keeps.
 
 CVXPY canonicalizes penalty and constraints once for a `Structure` (`canonical`), a loss once where Clarabel takes all
 of its rows (`Loss.canonical`), and some entries of a nonsmooth loss anew for every working set (`Loss.some`); besides,
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -39,7 +39,6 @@ from rpim_opt.convex.expressions import (
     reason,
     scalar,
     substituted,
-    term,
 )
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.quadratic import Quadratic, identity, quadratic
@@ -53,8 +52,6 @@ INVARIANT = (SQUARES, NORM2)
 """Losses that declare to see only the length of the residual: [A b] may be replaced by its QR factor."""
 TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
 """Clarabel's tolerances for variables of the functions' own."""
-MOST_CANONICALIZED = 20_000
-"""Equations of which the loss of a QR factor is canonicalized to see whether it is one of those."""
 
 
 class Expressions:
@@ -378,13 +375,14 @@ def structure(
     m, n = model.A.shape
     if not formulation.solvable:
         return Structure(formulation, model.parameters, m, model.members[0], forms)
-    if model.stands_for is not None:
-        counted = of_length(formulation, lambda: model.equations)
-        if counted is None:
-            where = f"formulation '{formulation.name}'"
-            raise InputError(where, "equations in blocks, of which only the QR factor is kept", "a squared loss")
-        formulation = counted
-    if formulation.loss in INVARIANT and formulation.loss_over == "equation":
+    by_length = formulation.loss in INVARIANT and formulation.loss_over == "equation"
+    if model.stands_for is not None and not by_length:
+        raise InputError(
+            f"formulation '{formulation.name}'",
+            "equations in blocks, of which only the QR factor is kept",
+            "cp.sum_squares or cp.norm2 of the equations as the loss",
+        )
+    if by_length:
         m = n + 1
     p, groups = model.parameters, model.members[0]
     if not formulation.ready:  # its functions may return another thing at every call
@@ -403,30 +401,6 @@ def structure(
 _KEPT: dict[Any, Structure] = {}
 MOST_KEPT = 64
 """Structures of ready formulations that are kept for the next model of their shape."""
-
-
-def of_length(formulation: Formulation, equations: Callable[[], int]) -> Formulation | None:
-    """Return the formulation whose loss sees only the length of the residual, in a way that holds for its QR factor.
-
-    A loss may depend on the number of equations: their mean square is no mean of the factor's rows. They are counted
-    where a loss is not known. None for one that sees more.
-    """
-    if formulation.loss_over != "equation" or (formulation.ready and formulation.loss not in INVARIANT):
-        return None
-    if formulation.loss in INVARIANT:
-        return formulation
-    count = equations()
-    if count > MOST_CANONICALIZED:
-        return None
-    try:
-        loss = term(formulation.loss, count, f"formulation '{formulation.name}', loss")
-    except ValueError:  # it is made for another number of residuals
-        return None
-    form = quadratic(loss.expression, loss.variable)
-    if form is None or not form.diagonal or form.c.any() or np.ptp(form.L) > 0:
-        return None
-    factor, constant = float(form.L[0] ** 2), form.constant
-    return replace(formulation, loss=lambda r: factor * cp.sum_squares(r) + constant)
 
 
 def in_blocks(formulation: Formulation) -> tuple[Formulation, QuadraticModel | None]:
