@@ -23,7 +23,7 @@ def finite_numbers(where: str, values: Any, *shapes: tuple[int, ...]) -> Array:
         raise InputError(where, f"a {type(values).__name__}", accepted) from None
     if array.shape not in shapes:
         raise InputError(where, f"shape {array.shape}", accepted)
-    for row in np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))[:1]:
+    for row in np.argwhere(~np.isfinite(array))[:1, 0]:
         raise InputError(f"{where}, row {row + 1}", f"{array[row].tolist()}", accepted)
     return array
 

@@ -98,7 +98,7 @@ def compare(
     asked = problems_of(problems)
     compared = methods_of(formulations, selectors, methods, options or {})
     ways = splits_of(splits)
-    sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1)
+    numbers_drawn = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1)
     if isinstance(seeds, int | np.integer) and not isinstance(seeds, bool):
         if seeds > MOST_DRAWS:
             raise InputError("seeds", f"{seeds}", f"at most {MOST_DRAWS} draws")
@@ -112,7 +112,7 @@ def compare(
     made = studies.provenance()
     drawn = {label for label, problem in asked.items() if not isinstance(problem, Instance)}
     cases: list[studies.Row] = []
-    for (label, problem), (split, size), count in product(asked.items(), ways.items(), sizes):
+    for (label, problem), (split, size), count in product(asked.items(), ways.items(), numbers_drawn):
         every = np.inf if callable(problem) else len(np.unique(problem.problem.data.configuration))
         # what a seed changes: what is generated or held out, which configurations are drawn
         seeded = callable(problem) or size > 0 or (count is not None and count < every)
@@ -134,7 +134,7 @@ def compare(
         "Problems": asked,
         "Methods": compared,
         "Held out": ways,
-        "Configurations": ["all" if count is None else str(count) for count in sizes],
+        "Configurations": ["all" if count is None else str(count) for count in numbers_drawn],
         "Seeds": map(str, numbered),
         "Metrics": figured,
         "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
