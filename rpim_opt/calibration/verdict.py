@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array, rms
+from rpim_opt.basics.arrays import TINY, Array, rms
 from rpim_opt.basics.exceptions import InputError, NotDelivered
 from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.basics.units import fits
@@ -43,7 +43,8 @@ REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint
 """Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise; a service robot had 5.3 mrad."""
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
-UNUSUAL_LENGTH = 0.004  # deviation of a length [m] from which on ready robots with nearly the same parameters are tried
+UNUSUAL_LENGTH = 0.004  # deviation of a length [m] from which on another robot or a wrong frame is the likelier reason
+ALIKE = 0.999  # cosine of two parameters' effects on the data from which on these do not distinguish them
 EXCLUDED = 0.25  # share of the rows that may be outliers
 COMPUTED, COMPUTED_RMS = 0.05, 2e-5  # nominal RMS over the stated noise, and itself [m], of computed positions
 ROUNDED = 1.1  # nominal RMS over what rounding of the measured values makes, below which they were computed, too
@@ -68,7 +69,8 @@ class Verdict:
 
     Exit codes, exports, compensation and the report follow it. ``reasons`` say why it is not delivered, a sentence
     each; empty where it is. ``caution`` is the condition that it depends on and that uncertainties do not contain:
-    signs and zeros of joints that were estimated, constraints that the data contradict; empty where there is none.
+    signs and zeros of joints that were estimated, constraints that the data contradict, a stated frame whose error
+    would look like a large deviation of the robot; empty where there is none.
 
     >>> import rpim_opt as ro
     >>> print(ro.calibrate(ro.load("position").problem, "tikhonov", 1.0, max_iterations=1).verdict)
@@ -119,7 +121,8 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     one with a likely mistake. The limits were set on 48 tables with mistakes and 36 good ones; joint zeros are not
     limited. Where the formulation limits the fit, other reasons than held-out rows follow from that, and are not named.
     """
-    caution = " ".join(filter(None, [result.mapping and result.mapping.caution, result.contradiction]))
+    mapping = result.mapping.caution if result.mapping else ""
+    caution = " ".join(filter(None, [mapping, result.contradiction, _like_a_frame(result)]))
     limited = tuple(text for text in causes if LIMITED in text)
     if limited:
         return Verdict((*limited, *_worse(result)), caution)
@@ -134,6 +137,32 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
         reasons.append(f"{len(out)} of {rows} rows are outliers, more than {EXCLUDED:.0%}.")
     reasons += [*_worse(result), *_computed(result), *causes]
     return Verdict(tuple(dict.fromkeys(reasons)), caution)
+
+
+def _like_a_frame(result: Outcome) -> str:
+    """Return a sentence if errors of a frame look to the data like the largest deviation of one of the robot's lengths.
+
+    A wrong length of a stated tool is a deviation of the last d.
+    """
+    p = result.problem.parameters
+    of_arm = (np.array(p.free.dimensions) == "length") & ~p.of_frames[p.identified]
+    worst = int(np.argmax(np.abs(result.x) * of_arm))
+    if not result.problem.keeps_rows or abs(result.x[worst]) * of_arm[worst] < UNUSUAL_LENGTH:
+        return ""
+    framed = cast(CalibrationProblem, result.problem).identifying(p.identified | p.of_frames)
+    x = np.zeros(len(p))
+    x[p.identified] = result.x
+    free, name = framed.parameters.free, p.free.names[worst]
+    effects = framed.jacobian(x[framed.parameters.identified])
+    effects /= np.maximum(np.linalg.norm(effects, axis=0), TINY)
+    alike = np.abs(effects.T @ effects[:, free.names.index(name)]) > ALIKE
+    frames = np.array(free.names)[alike & framed.parameters.of_frames[framed.parameters.identified]].tolist()
+    if not frames:
+        return ""
+    return (
+        f"{name} deviates by {in_unit(result.x[worst], 'length')}, which the data do not distinguish from an error of "
+        f"the stated {joined(frames)}: check it. If it is wrong, this robot is right only together with it."
+    )
 
 
 def kept_rows(result: Outcome) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.arrays import TINY, Array, rms
+from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.units import display, printed
 from rpim_opt.bayes.hyperparameters import Learned, Size
@@ -34,7 +34,6 @@ DEFLECTIONS = {
 }
 """Model extensions whose scales are reported as deflections, at the configuration where these are largest."""
 UNUSUAL = 10.0  # scales of its group beyond which a deviation is said to be unusual: 2 in 1000 are under Student's t_3
-ALIKE = 0.999  # cosine of two parameters' effects on the data from which on these do not distinguish them
 MOST = 5  # unusual parameters and outliers that are named one by one
 VAGUE = 0.5  # standard deviation of the logarithm of a hyperparameter from which on only its upper bound is said
 NEGLIGIBLE = 0.1  # share of the largest part of the repeatability below which another is not said
@@ -124,7 +123,7 @@ def weight_lines(result: Outcome) -> list[str]:
         return [f"Formulation '{name}'.", f"{text}."]
     if result.learned is not None:
         names = result.problem.parameters.free.names
-        return [f"Formulation '{name}'.", *learned_lines(result.learned, names, result.z, result.program.model.A)]
+        return [f"Formulation '{name}'.", *learned_lines(result.learned, names, result.z)]
     if result.formulation.penalty is None:
         return [f"Formulation '{name}' has no penalty and needs no weight."]
     if result.selection is None:
@@ -188,17 +187,13 @@ def _outlying(result: Outcome, advised: bool) -> list[str]:
 # --- hyperparameters --------------------------------------------------------------------------------------------
 
 
-def learned_lines(learned: Learned, names: tuple[str, ...], z: Array, A: Array) -> list[str]:
-    """Return sentences on estimated hyperparameters, from names (n,), z (n,) in local scales, and slopes A (m, n)."""
+def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[str]:
+    """Return sentences on estimated hyperparameters, from names (n,) and z (n,) in local scales."""
     ratio = np.abs(z) * learned.local
     unusual = []
     for i in np.argsort(-ratio)[:MOST]:
         if ratio[i] > UNUSUAL:
             cause = "an assembly or joint-zero error" if is_joint_offset(names[i]) else "check it in the data sheet"
-            cosines = A[:, i] @ A / np.maximum(np.linalg.norm(A, axis=0) * np.linalg.norm(A[:, i]), TINY)
-            alike = [name for k, name in enumerate(names) if k != i and abs(cosines[k]) > ALIKE]
-            if alike:
-                cause += f", or {joined(alike)}, which the data do not distinguish from it"
             unusual.append(f"{names[i]} deviates by {ratio[i]:.0f} prior standard deviations of its group: {cause}.")
     lines = [f"{what}: {joined(parts)}." for what, parts in _estimates(learned, names, z).items() if parts]
     lines += [*_model_lines(learned), *unusual]

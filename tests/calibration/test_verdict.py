@@ -95,6 +95,19 @@ def test_joint_zeros_are_not_limited() -> None:
     assert ro.calibrate(off).verdict.delivered
 
 
+def test_a_stated_tool_that_is_wrong_looks_like_the_last_link() -> None:
+    """The fit is as good as with the right one: the condition is named wherever the robot is used."""
+    problem = ro.load("position").problem
+    p = problem.parameters
+    tool_z = np.array(p.names) == "tool_z"
+    stated = replace(p, nominal=p.nominal + 0.01 * tool_z, identified=p.identified & ~tool_z)
+    verdict = ro.calibrate(problem.with_parameters(stated)).verdict
+    assert verdict.delivered
+    assert verdict.caution.startswith("d6 deviates by -9.0")
+    assert "an error of the stated tool_z: check it." in verdict.require()
+    assert not ro.calibrate(problem.with_parameters(replace(stated, identified=p.identified))).verdict.caution
+
+
 def test_computed_positions_are_no_measurements() -> None:
     problem = simulated_arm("ur5e")
     y = problem.modelled(np.zeros(len(problem.parameters.free)))[0]
