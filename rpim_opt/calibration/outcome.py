@@ -53,7 +53,6 @@ from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.parameters import own_name
 
 CONTRADICTED = 1e-6  # probability of what constraints cost, if they hold for the robot, below which they do not
-ACTIVE = 1e-6  # relative multiplier from which on, and distance up to which, a constraint is active
 COVERAGE_FACTOR = 2.0  # of an expanded uncertainty where no confidence is stated: about 95 % of a normal distribution
 
 
@@ -545,9 +544,8 @@ class Outcome:
         parameters, rows = program.model.parameters, program.model.equations
         multiplier = np.sum(self._multipliers, axis=0)
         loss = program.value(z)[0]
-        near = np.minimum(z - low, high - z) < ACTIVE * (1 + np.abs(z))
         bounds = []
-        for i in np.flatnonzero((multiplier > ACTIVE * loss / rows) & near & (low < high)):
+        for i in np.flatnonzero((multiplier > 0) & (low < high)):
             bound = float(min(low[i], high[i], key=lambda side: abs(z[i] - side)))
             less = max(loss - 0.1 * abs(bound) * multiplier[i], 0.0)
             gain = float(np.sqrt(loss / rows) - np.sqrt(less / rows))
@@ -567,11 +565,8 @@ class Outcome:
         prices = []
         for i, parsed in texts:
             unit, si = parsed.unit
-            slack, scale = parsed.slack(z, parameters), parsed.scale(parameters)
+            slack = parsed.slack(z, parameters)
             multiplier = parsed.price(self._multipliers[i], parameters)
-            met = slack > ACTIVE * scale * (1 + float(np.max(np.abs(z))))
-            if met or multiplier * scale <= ACTIVE * max(misfit, ACTIVE):  # an interior point's are not zero
-                multiplier = 0.0
             gain = min(multiplier * parsed.step, misfit)
             figures = max(slack, 0.0) / si, multiplier * si, parsed.step / si, gain, misfit
             prices.append(ShadowPrice(parsed.text, unit, *figures))
@@ -579,8 +574,8 @@ class Outcome:
 
     @cached_property
     def _multipliers(self) -> Sequence[Array]:
-        """Multipliers of the formulation's constraints."""
-        return self.program.beginning(self.z).solve(self.weight).duals
+        """Multipliers of the formulation's constraints, zero where they are not active."""
+        return self.program.active_multipliers(self.z, self.weight)
 
     @cached_property
     def active_constraints(self) -> tuple[str, ...]:
@@ -588,9 +583,7 @@ class Outcome:
         constraints = self.formulation.constraints
         if not constraints or not self.formulation.solvable:
             return ()
-        least = ACTIVE * max(self.program.objective(self.z, self.weight), ACTIVE)
-        holds = (np.abs(multiplier).max(initial=0.0) > least for multiplier in self._multipliers)
-        return tuple(name_of(each, k) for k, (each, held) in enumerate(zip(constraints, holds, strict=True)) if held)
+        return tuple(name_of(constraints[k], k) for k, values in enumerate(self._multipliers) if values.any())
 
     @cached_property
     def actively_constrained(self) -> tuple[str, ...]:

@@ -31,6 +31,8 @@ ACTIVE = 1e-7
 """Part of the largest multiplier from which a constraint is active."""
 TOUCHING = 1e-9
 """Distance from a bound, in scales, at which a component counts as lying on it."""
+SOFTEST = 1e-8
+"""Part of the objective that counts as the least curvature where the weight is smaller."""
 WELL_CONDITIONED = 1e-6
 """Reciprocal condition number above which a triangular factor is solved with."""
 PROXIMAL = 1e-2, 1e-4, 1e-6
@@ -406,27 +408,18 @@ class Program(Brief):
     def tangent(self, z: Array, weight: float) -> Array | None:
         """Return an orthonormal basis (n, k) of the active constraints' null space at z.
 
-        Equations, and inequalities and cones with a multiplier, linearized at z; own variables move along. None where
-        no constraint is active, and with own variables that the loss shares, where it is not known.
+        Equations, inequalities and cones, linearized at z; own variables move along. None where no constraint is
+        active, and with own variables that the loss shares, where it is not known.
         """
-        if not self.formulation.constraints or self.structure.joint:
+        found = None if self.structure.joint else self._active(z, weight)
+        if found is None:
             return None
-        try:
-            optimum = minimum(self._rows, WarmStart(self.structure).begin(z), weight)
-        except Unsolved:
-            return None
-        p = self.structure.canonical
-        limit = ACTIVE * max(np.abs(optimum.dual).max(initial=0.0), TOUCHING)
+        p, (optimum, active) = self.structure.canonical, found
         dense = p.dense[0]
-        linear = np.arange(p.linear)
-        active = (linear < p.zero) | (np.abs(optimum.dual[linear]) > limit)
-        normals = [dense[linear[active]]]
-        start = p.linear
-        for count in p.cone_sizes:
-            part = slice(start, start + count)
-            if np.abs(optimum.dual[part]).max() > limit:
+        normals = [dense[: p.linear][active[: p.linear]]]
+        for part in p.cone_rows:
+            if active[part.start]:
                 normals.append(optimum.dual[part][None] @ dense[part])
-            start += count
         G = np.vstack(normals)
         if not len(G):
             return None
@@ -435,6 +428,34 @@ class Program(Brief):
         moves = V[rank:].T[p.at]
         U, values, _ = np.linalg.svd(moves, full_matrices=False)
         return U[:, values > TOUCHING]
+
+    def active_multipliers(self, z: Array, weight: float) -> tuple[Array, ...]:
+        """Return the multipliers at z by constraint function, zero where a constraint is not active."""
+        found = self._active(z, weight)
+        return () if found is None else self._duals(replace(found[0], dual=np.where(found[1], found[0].dual, 0.0)))
+
+    def _active(self, z: Array, weight: float) -> tuple[Point, np.ndarray] | None:
+        """Return the minimum from z on, and which rows of the constraints are active there (m,), cones as a whole.
+
+        An interior point leaves multipliers and slacks of which neither is zero: a constraint is active if its
+        multiplier is above its slack times the least curvature that the penalty has. None without constraints, and
+        where there is no minimum.
+        """
+        if not self.formulation.constraints:
+            return None
+        try:
+            optimum = minimum(self._rows, WarmStart(self.structure).begin(z), weight)
+        except Unsolved:
+            return None
+        p = self.structure.canonical
+        size, slack = np.abs(optimum.dual), p.b - p.A @ optimum.x
+        for k, part in enumerate(p.cone_rows):
+            size[part] = size[part].max()
+            first, *others = slack[part]
+            slack[part] = first - np.linalg.norm(others) if k < p.second_order else 0.0
+        objective = self.objective(z, weight)
+        least = np.maximum(max(weight, SOFTEST * objective) * slack, max(ACTIVE * size.max(), TOUCHING * objective))
+        return optimum, (size > least) | (np.arange(len(size)) < p.zero)
 
     def _weight(self, weight: float) -> float:
         """Return the weight, checked; zero where there is no penalty for it to multiply."""

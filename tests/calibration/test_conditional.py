@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cvxpy as cp
@@ -33,6 +34,29 @@ def test_a_parameter_that_is_held_has_no_width_and_the_others_those_of_a_problem
     found, expected = widths(held), widths(without)
     assert found.pop("theta3") == found.pop("d5") == 0.0
     assert found == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("loss", ["squares", "Huber"])
+@pytest.mark.parametrize(
+    "constraint",
+    [
+        lambda z, _: cp.norm(z) <= 5.0,
+        lambda z, _: cp.abs(z) <= 500.0,
+        lambda z, p: cp.norm(cp.vec(p.positions([[0.1, 0.2, 0.3, 0.4, 0.5, 0.6]]), order="C")) <= 9.0,
+        lambda z, _: cp.bmat([[z[3], 1.0], [1.0, 9.0 - z[3]]]) + 5.0 * np.eye(2) >> 0,
+        lambda z, _: cp.exp(z[3]) <= 50.0,
+    ],
+    ids=["ball", "absolute values", "positions", "matrix", "exponential"],
+)
+def test_a_constraint_that_is_not_active_changes_no_width(constraint: Any, loss: str) -> None:
+    """An interior point's multipliers are not zero: widths were zero, or constraints said to be contradicted."""
+    form = ro.robust if loss == "Huber" else ro.tikhonov
+    free = ro.calibrate(PROBLEM, form, 1.0)
+    result = ro.calibrate(PROBLEM, replace(form, constraints=(constraint,)), 1.0)
+    assert np.linalg.norm(free.z) < 4.9
+    assert result.active_constraints == ()
+    assert widths(result) == pytest.approx(widths(free), rel=1e-3)
+    assert result.verdict == ro.calibration.Verdict()
 
 
 def test_intervals_say_on_which_own_constraints_they_rest() -> None:

@@ -7,6 +7,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from importlib import import_module
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -151,6 +152,12 @@ class Canonical:
         """Whether an active set may solve it: equations and inequalities alone, without variables of functions' own."""
         return self.linear == len(self.b) and not self.own and len(self.b) * self.size <= DENSE
 
+    @property
+    def cone_rows(self) -> list[slice]:
+        """The rows of each cone."""
+        ends = np.cumsum([self.linear, *self.cone_sizes]).tolist()
+        return [slice(begin, end) for begin, end in pairwise(ends)]
+
     @cached_property
     def dense(self) -> tuple[Array, Array]:
         """A and P as dense matrices."""
@@ -205,10 +212,9 @@ class Canonical:
         """Return the violation of equations, inequalities and second-order cones at x (N,), as they were stated."""
         slack = np.divide(self.b - self.A @ x, self.row_scale, out=np.zeros(len(self.b)), where=self.row_scale > 0)
         worst = [np.abs(slack[: self.zero]).max(initial=0.0), -slack[self.zero : self.linear].min(initial=0.0)]
-        begin = self.linear
-        for count in self.cone_sizes[: self.second_order]:
-            worst.append(np.linalg.norm(slack[begin + 1 : begin + count]) - slack[begin])
-            begin += count
+        for part in self.cone_rows[: self.second_order]:
+            first, *others = slack[part]
+            worst.append(np.linalg.norm(others) - first)
         return float(max(worst))
 
     def duals(self, x: Array, z: Array) -> dict[int, Array]:
