@@ -266,7 +266,7 @@ def search(points: Points, problem: CalibrationProblem | None = None) -> JointMa
     if n < len(robot.mdh):  # a sign or zero of a joint would not say what follows it
         return None
     turning = _turning(robot)
-    few = points.evenly(FEW if points.turns is None else FEW // 2)  # a pose is four points
+    few = points.evenly(FEW if points.turns is None else FEW // 4)  # a pose is four points
     base = Candidates.of([few])
     free = few.y.size - max(n - 2, 0) - base.tools.size - 6
     if free < FEWEST_FREE or n > MOST_JOINTS:

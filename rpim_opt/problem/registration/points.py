@@ -145,7 +145,7 @@ class Candidates(NamedTuple):
     """B sets of N points to be fitted at once."""
 
     robot: Robot
-    q: Array  # (B, NK, dof) joint values of the model
+    q: Array  # (B, NK, dof) joint values of the model; of poses one for their four points
     y: Array  # (B, N, 3) positions or (B, N, 1) lengths [m]
     marker: np.ndarray  # (B, NK) reflectors
     zero: Array  # (B, dof) start values of joint zeros
@@ -168,7 +168,7 @@ class Candidates(NamedTuple):
         turns = [LEVER * points.extent * points.turns for points in tries if points.turns is not None]
         if turns:
             axes = np.swapaxes(np.stack(turns), 2, 3)
-            q, tools = q.repeat(4, axis=1), tools.repeat(4, axis=1)
+            tools = tools.repeat(4, axis=1)
             y = np.concatenate([y[:, :, None], y[:, :, None] + axes], axis=2).reshape(B, -1, 3)
             marker = (4 * marker[:, :, None] + np.arange(4)).reshape(B, -1)
             spread = np.tile([TOOL_ERROR, *3 * [10 * TOOL_ERROR]], M)
@@ -199,7 +199,7 @@ def fit_arms(
     """
     B = len(candidates.y)
     columns = 3 + 3 * len(candidates.stated) + zeros * candidates.zero.shape[1]
-    parts = np.array_split(np.arange(B), 1 + B * candidates.q.shape[1] * 3 * columns // LARGEST_BATCH)
+    parts = np.array_split(np.arange(B), 1 + B * candidates.marker.shape[1] * 3 * columns // LARGEST_BATCH)
     return stacked([_fitted(candidates.take(some), steps, zeros, robust, noise) for some in parts])
 
 
@@ -255,7 +255,7 @@ def _fits_of_all(points: Points, sets: np.ndarray) -> Fit:
     """Return the fits to each set (B, K) of rows, with their residuals of all rows; errors of poses with their tips."""
     fits = fit_arms(Candidates.of([points.take(each) for each in sets]), STEPS)
     every = Candidates.of([points])
-    turn, p, _, _ = _flange(every.robot, every.q)
+    turn, p, _, _ = _flange(every, every.zero)
     tau = np.moveaxis(fits.tools[:, every.marker[0]], -1, 0)
     there = p + turn[0] * tau[0] + turn[1] * tau[1] + turn[2] * tau[2]
     modelled = np.einsum("bij,jbn->bni", fits.base[:, :3, :3], there) + fits.base[:, None, :3, 3]
@@ -353,7 +353,7 @@ def _fitted(candidates: Candidates, steps: int, zeros: bool, robust: bool, noise
 
     def at(zero: Array, tools: Array) -> _State:
         """Return the state at joint zeros (B, dof) and reflectors (B, M, 3)."""
-        turn, p, axes, origins = _flange(candidates.robot, candidates.q + zero[:, None])
+        turn, p, axes, origins = _flange(candidates, zero)
         tau = np.moveaxis(tools[np.arange(B)[:, None], candidates.marker], -1, 0)
         points = p + turn[0] * tau[0] + turn[1] * tau[1] + turn[2] * tau[2]
         base, offset, away, residual = eliminated(points, y, weights)
@@ -380,7 +380,8 @@ def _fitted(candidates: Candidates, steps: int, zeros: bool, robust: bool, noise
         damping = np.where(better, np.maximum(damping / 4, 1e-9), np.minimum(damping * 4, 1e6))
         zero = np.where(better[:, None], other_zero, zero)
         tools = np.where(better[:, None, None], other_tools, tools)
-        state = candidate if better.all() else at(zero, tools)
+        masks = (better[:, None, None], better, better, *6 * [better[:, None]])
+        state = candidate if better.all() else _State(*map(np.where, masks, candidate, state))
         stalled = 0 if fell.any() else stalled + 1
         if stalled == 5:
             break
@@ -397,8 +398,9 @@ def _fitted(candidates: Candidates, steps: int, zeros: bool, robust: bool, noise
     return Fit(modelled, error, state.cost, base, tools, zero, state.offset)
 
 
-def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
+def _flange(candidates: Candidates, zero: Array) -> list[Array]:
     """Return rotation columns (3, 3, B, N) and origins (3, B, N) of flanges, axes and origins (dof, 3, B, N)."""
+    robot, q = candidates.robot, candidates.q + zero[:, None]
     B, N, dof = q.shape
     x, y, z = (np.broadcast_to(e[:, None, None], (3, B, N)) for e in np.eye(3))
     p = np.zeros((3, B, N))
@@ -418,7 +420,7 @@ def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
         if beta:
             c, s = np.cos(beta), np.sin(beta)
             x, z = c * x - s * z, c * z + s * x
-    return np.stack([x, y, z]), p, axes, origins
+    return [each.repeat(candidates.marker.shape[1] // N, axis=-1) for each in (np.stack([x, y, z]), p, axes, origins)]
 
 
 def _step(
@@ -429,7 +431,7 @@ def _step(
     M = len(candidates.stated)
     dof = candidates.zero.shape[1] if zeros else 0
     turning = 3 * (coordinates == 3)
-    J = np.zeros((B, 3 * M + dof + turning, 3, candidates.q.shape[1]))
+    J = np.zeros((B, 3 * M + dof + turning, 3, candidates.marker.shape[1]))
     for m in range(M):
         seen = candidates.marker == m
         for k in range(3):
@@ -447,9 +449,9 @@ def _step(
             J = J[..., 1::2] - J[..., ::2]
         unit = state.away / np.maximum(np.linalg.norm(state.away, axis=0), 1e-9)
         J = np.einsum("bcin,ibn->bcn", J, unit)[:, :, None]
-        if candidates.q.shape[1] == N:  # the anchor, and the offset as the mean
+        if candidates.marker.shape[1] == N:  # the anchor, and the offset as the mean
             J = np.concatenate([J, np.moveaxis(unit, 0, 1)[:, :, None]], axis=1)
-    if candidates.q.shape[1] == N:
+    if candidates.marker.shape[1] == N:
         share = (weights / weights.sum(axis=1, keepdims=True))[:, None, None]
         J -= (J * share).sum(axis=-1, keepdims=True)
     root = np.sqrt(weights)[:, None, None]
