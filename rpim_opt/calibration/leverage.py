@@ -52,11 +52,6 @@ class Influence(Tabled):
     deviation: Array
     weight: Array
 
-    @property
-    def standardized(self) -> Array:
-        """Changes (C, n) in units of the parameters' standard deviations (DFBETAS)."""
-        return np.divide(self.change, self.deviation, out=np.zeros_like(self.change), where=self.deviation > 0)
-
     def _short(self) -> str:
         most = int(np.argmax(self.cook))
         return f"of {len(self.label)} configurations: {self.label[most]} has Cook's distance {self.cook[most]:.2g}"

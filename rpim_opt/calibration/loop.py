@@ -383,8 +383,10 @@ class Loop:
         if after <= state.merit + rounding:
             return replace(self._accepted(state, candidate, z, after, short), damping=damping)
         state = replace(state, damping=damping)
+        if (short or nothing) and state.choice.settled:
+            return replace(state, outcome="rest")
         if short or nothing:
-            return _rested(state)
+            return replace(state, choice=state.choice.after(0.0))
         if damping > DAMPING_MOST or not np.isfinite(damping):
             return replace(state, outcome="stuck")
         return state
@@ -515,13 +517,6 @@ def _certified(loop: Loop, problem: Source, state: State) -> Ended:
         model = around(anew.linearize(loop.scale * state.z), loop.about)
     certificate = certified(loop.solved, model, state.z, state.choice.weight, state.floor, residual)
     return Ended(state, loop.scale * state.z, certificate)
-
-
-def _rested(state: State) -> State:
-    """Return the state where no step lowers the objective: the end, or a choice of the weight."""
-    if state.choice.settled:
-        return replace(state, outcome="rest")
-    return replace(state, choice=state.choice.after(0.0))
 
 
 def damped(damping: float, gain: float, promised: float, effect: float) -> float:

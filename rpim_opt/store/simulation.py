@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -65,18 +65,11 @@ class Simulation(Table):
     truth: dict[str, Any] = Field(default_factory=dict)
 
 
-class Simulated(NamedTuple):
-    """Simulated tables by file name, with the true deviations [SI] by parameter and the labels of gross errors."""
+def write_simulation(name: str | Path, seed: int | None = None, out: Path | None = None) -> list[Path]:
+    """Write the tables of a problem folder that has a ``[simulation]`` table (the guide "The command line").
 
-    tables: Mapping[str, Columns]
-    deviations: Mapping[str, tuple[str, float]]
-    blunders: tuple[str, ...]
-
-
-def simulate(name: str | Path, seed: int | None = None) -> Simulated:
-    """Make the tables of a problem folder that has a ``[simulation]`` table (the guide "The command line").
-
-    True deviations are normal with the scales as standard deviations, times ``spread``, for every identified
+    They go into the folder, or into another, with ``truth.toml``: true deviations and labels of blunders. The files are
+    returned. True deviations are normal with the scales as standard deviations, times ``spread``, for every identified
     parameter; those of ``[simulation.truth]`` are fixed instead. Joint values are uniform in ``joint_share`` of
     the limits. Identification data carry the declared noise, validation data none. The tables need not exist yet.
     """
@@ -100,7 +93,7 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     with in_file(definition.path):
         for (name, _), value in quantities(plan.truth, dimensions, "table simulation.truth").items():
             x[free.names.index(name)] = value
-    tables: dict[str, Columns] = {}
+    texts: dict[str, str] = {}
     blunders: list[str] = []
     for role, count in (("identification", plan.configurations), ("validation", plan.validation)):
         with in_file(definition.path):
@@ -114,10 +107,19 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
             if count and file:
                 kind = definition.kinds[each.measurement]
                 maker = _Table(definition, plan, parameters, x, each, kind, markers, of, rng, role == "identification")
-                tables[file], wrong = maker.made(q)
+                columns, wrong = maker.made(q)
+                texts[file] = csv_text(columns, zip(*columns.values(), strict=True))
                 blunders += wrong
-    truth = zip(free.names, free.dimensions, x.tolist(), strict=True)
-    return Simulated(tables, {name: (dimension, value) for name, dimension, value in truth}, tuple(blunders))
+    labels = ", ".join(f'"{label}"' for label in blunders)
+    lines = [f"# made by: rpim-opt simulate {Path(name).name}", f"blunders = [{labels}]", "", "[deviation]"]
+    for parameter, dimension, value in zip(free.names, free.dimensions, x.tolist(), strict=True):
+        unit, si = display(dimension)
+        lines.append(f"{f'{parameter}_{unit}'.rstrip('_')} = {value / si:.12g}")
+    texts["truth.toml"] = "\n".join(lines) + "\n"
+    folder = out or definition.path.parent
+    places = {inside(folder, file, "the file", folder): text.encode() for file, text in texts.items()}
+    write_files(places)
+    return list(places)
 
 
 def _parameters(stated: ProblemFile) -> tuple[list[tuple[str, ...]], Parameters]:
@@ -141,22 +143,6 @@ def _parameters(stated: ProblemFile) -> tuple[list[tuple[str, ...]], Parameters]
             entries[whole] = dimension, own.get(whole, 0.0)
     base = (0.0,) * 6 if stated.base is None else stated.base
     return fixtures, stated.chosen(model_parameters(stated.robot, base, stated.tools, entries), nothing)
-
-
-def write_simulation(name: str | Path, seed: int | None = None, out: Path | None = None) -> list[Path]:
-    """Write the tables of `simulate` and ``truth.toml`` into the folder, or into another; return the files."""
-    made = simulate(name, seed)
-    folder = out or read_problem(name).path.parent
-    texts = {file: csv_text(table, zip(*table.values(), strict=True)) for file, table in made.tables.items()}
-    blunders = ", ".join(f'"{label}"' for label in made.blunders)
-    lines = [f"# made by: rpim-opt simulate {Path(name).name}", f"blunders = [{blunders}]", "", "[deviation]"]
-    for parameter, (dimension, value) in made.deviations.items():
-        unit, si = display(dimension)
-        lines.append(f"{f'{parameter}_{unit}'.rstrip('_')} = {value / si:.12g}")
-    texts["truth.toml"] = "\n".join(lines) + "\n"
-    places = {inside(folder, file, "the file", folder): text.encode() for file, text in texts.items()}
-    write_files(places)
-    return list(places)
 
 
 @dataclass(frozen=True, eq=False)
