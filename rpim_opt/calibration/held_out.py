@@ -124,12 +124,12 @@ def excluded_by_fit(result: Calibration) -> list[str]:
     return [] if held is None else [label for label in held.label if label not in used]
 
 
-def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibration:
+def refit_all(result: Calibration) -> Calibration:
     """Return the calibration from identification and validation rows together, with the same settings.
 
     Errors on the held-out rows, which validate the procedure, stay in its record (``held_out``); the parameters come
-    from all rows. No row is left that checks these alone. ``validation`` are the held-out rows, by default those of the
-    record. InputError where there are none, or measurements are not in memory.
+    from all rows. No row is left that checks these alone. The held-out rows are the record's. InputError where there
+    are none, or measurements are not in memory.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
@@ -138,7 +138,7 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
     >>> f"{1e3 * everything.record.held_out.error.mean():.3f} mm, then {len(everything.problem.data)} rows"
     '0.024 mm, then 80 rows'
     """
-    apart = result.record.validation if validation is None else validation
+    apart = result.record.validation
     if apart is None:
         raise InputError("validation", "no held-out rows", "a calibration with validation data")
     original = result.stated

@@ -69,10 +69,10 @@ class Uncertainty(Tabled):
         """Coverage factor k, the Student-t quantile at (1 + confidence) / 2 with at least one degree of freedom."""
         return float(coverage_factor(self.result.freedom, self.confidence))
 
-    def intervals(self) -> Array:
-        """Return the lower and upper limits (n, 2) [SI] of the deviations' intervals."""
-        half = self.coverage_factor * np.sqrt(np.diag(self.result.covariance))
-        return np.column_stack([self.result.x - half, self.result.x + half])
+    @property
+    def expanded(self) -> Array:
+        """Expanded uncertainties U = k u (n,) [SI] of the deviations: half widths of their intervals."""
+        return self.coverage_factor * np.sqrt(np.diag(self.result.covariance))
 
     def _short(self) -> str:
         return f"at confidence {self.confidence:g} of {repr(self.result).strip('<>')}"
@@ -83,7 +83,7 @@ class Uncertainty(Tabled):
         spread = self.result.spread
         noise, prior, both = (np.sqrt(np.diag(C)) for C in (spread.noise, spread.prior, spread.covariance))
         columns = {"value": free.values(self.result.x), "u_noise": noise, "u_prior": prior, "u": both}
-        columns["U"] = self.coverage_factor * both
+        columns["U"] = self.expanded
         constrained = (both == 0) | np.isin(free.names, self.result.actively_constrained)
         rows = free.rows(columns)
         return [{**row, "actively_constrained": bool(held)} for row, held in zip(rows, constrained, strict=True)]

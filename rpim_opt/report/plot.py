@@ -14,7 +14,6 @@ import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
-from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import TransmissionError, Uncertainty
@@ -82,8 +81,8 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     return _with_legend(ax)
 
 
-def parameters(result: Calibration, dimension: str = "length", confidence: float = 0.95, ax: Axes = None) -> Axes:
-    """Draw the deviations of the robot's parameters of a dimension with their intervals and tolerances.
+def parameters(result: Calibration, dimension: str = "length", ax: Axes = None) -> Axes:
+    """Draw the deviations of the robot's parameters of a dimension with their 95 % intervals and tolerances.
 
     The dimension is ``length`` [mm], ``angle`` [deg], ``ratio`` [ppm] or ``compliance`` [mrad/Nm]. Intervals exist
     where the formulation has a covariance.
@@ -101,14 +100,13 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     x = result.x[own] / si
     spread = np.zeros(len(own))
     with suppress(InputError):
-        half = np.diff(Uncertainty(result, confidence).intervals())[:, 0] / 2
-        spread = np.nan_to_num(half[own] / si, posinf=0.0)
+        spread = np.nan_to_num(Uncertainty(result).expanded[own] / si, posinf=0.0)
     bound = active_tolerance(result)[own] / si
     bounded = np.isfinite(bound)
     place = np.arange(1.0, len(own) + 1)
     ax.axvline(0, color=COLORS["before"], lw=1)
     ax.hlines(place, x - spread, x + spread, color=COLORS["after"])
-    _dots(ax, x, place, "after", f"deviation, {percent(confidence)} interval")
+    _dots(ax, x, place, "after", "deviation, 95 % interval")
     if bounded.any():
         ends = np.concatenate([-bound[bounded], bound[bounded]])
         at = np.tile(place[bounded], 2)

@@ -275,7 +275,7 @@ def _parameters(content: Content) -> Iterator[Block]:
     head = ["parameter", "nominal", "identified", "deviation", "U", "tolerance"]
     with contextlib.suppress(InputError):
         uncertainty = Uncertainty(result)
-        half = uncertainty.coverage_factor * np.sqrt(np.diag(result.covariance))
+        half = uncertainty.expanded
         k = f"k = {uncertainty.coverage_factor:.2f}"
         head[4] = f"U ({k})"
         t = f"Student's t with {result.freedom:.0f} effective degrees of freedom"

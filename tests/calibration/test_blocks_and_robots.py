@@ -81,7 +81,7 @@ def test_what_needs_all_rows_says_so_of_measurements_in_parts() -> None:
     assert likely_causes(parts) == []
     held_out = one().data.take(np.arange(3))
     with pytest.raises(ro.InputError, match="data in blocks, accepted: measurements in memory"):
-        refit_all(parts, held_out)
+        refit_all(replace(parts, record=replace(parts.record, validation=held_out)))
     with pytest.raises(ro.InputError, match="no held-out rows"):
         refit_all(result())
 

@@ -42,7 +42,7 @@ def test_intervals_are_students() -> None:
         u = Uncertainty(RESULT, confidence)
         assert u.coverage_factor == pytest.approx(student.ppf((1 + confidence) / 2, RESULT.freedom), rel=1e-9)
         half = u.coverage_factor * np.sqrt(np.diag(RESULT.covariance))
-        assert u.intervals() == pytest.approx(np.column_stack([RESULT.x - half, RESULT.x + half]), rel=1e-9, abs=1e-12)
+        assert u.expanded == pytest.approx(half, rel=1e-9, abs=1e-12)
     for wrong in (0.0, 1.0, -0.5, 95.0):
         with pytest.raises(ro.InputError, match="a probability between 0 and 1"):
             Uncertainty(RESULT, wrong)
