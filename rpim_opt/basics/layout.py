@@ -481,7 +481,9 @@ def _one_row_each(table: RawTable) -> RawTable:
     if not points:
         accepted = f"a column that names the point, with {', '.join(parts)} once for each point"
         raise InputError("the header", f"one row per coordinate ('{axis}')", accepted)
-    columns = _of_points(texts, points)
+    # of columns with one text for all rows of a point, that one
+    every = {name: [{cells[i] for i in rows.values()} for rows in points] for name, cells in texts.items()}
+    columns = {name: [min(own) for own in each] for name, each in every.items() if max(map(len, each)) == 1}
     value = _value_column({name: cells for name, cells in texts.items() if name not in columns})
     units = [cells for cells in texts.values() if {cell.lower() for cell in cells} <= UNIT_SIGNS]
     for part in parts:
@@ -490,12 +492,6 @@ def _one_row_each(table: RawTable) -> RawTable:
         columns[_with_unit(part, unit)] = [texts[value][rows[part]] if part in rows else "" for rows in points]
     note = f"one row per coordinate: column '{value}' by '{axis}'."
     return replace(table, columns=columns, notes=(*table.notes, note))
-
-
-def _of_points(texts: Mapping[str, list[str]], points: Sequence[Mapping[str, int]]) -> dict[str, list[str]]:
-    """Return the columns that hold one text for all rows of a point, with one cell for each point."""
-    every = {name: [{cells[i] for i in rows.values()} for rows in points] for name, cells in texts.items()}
-    return {name: [min(own) for own in each] for name, each in every.items() if max(map(len, each)) == 1}
 
 
 def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:

@@ -148,15 +148,6 @@ def _matching(folder: Path, pattern: str) -> set[Path]:
     return {file for file in files if file.is_file() and file.suffix != ".pyc"}
 
 
-def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> str:
-    """Return a sentence on the command, commit, files and versions that produce the replicates."""
-    name = _label(path) if path.parent == STUDIES else path.name
-    source = f"`rpim-opt study {name}{' --quick' if quick else ''}`, {file_state(path)}, with {package_state()}"
-    digest = sha256(repr(sorted(files.items())).encode()).hexdigest()[:SHORT]
-    known = f"{len(files)} files in its folder or named by it have SHA-256 {digest}; others that it reads are not known"
-    return f"Made by {source}: {count} replicates, {versions()}. {known}."
-
-
 def run_study(
     name: str | Path,
     quick: bool = False,
@@ -207,7 +198,12 @@ def _replicate(
         study.prepare(quick)
     cases = study.cases(quick)
     files = files_of(path, study)
-    made = made_by(path, quick, len(cases), files)  # of what is here now, whatever becomes of it meanwhile
+    # what makes them is what is here now, whatever becomes of it meanwhile
+    name = _label(path) if path.parent == STUDIES else path.name
+    source = f"`rpim-opt study {name}{' --quick' if quick else ''}`, {file_state(path)}, with {package_state()}"
+    digest = sha256(repr(sorted(files.items())).encode()).hexdigest()[:SHORT]
+    known = f"{len(files)} files in its folder or named by it have SHA-256 {digest}; others that it reads are not known"
+    made = f"Made by {source}: {len(cases)} replicates, {versions()}. {known}."
     code = {**{f"file {each}": digest for each, digest in files.items()}, **package_code()}
     journal = file.with_suffix(".jsonl")
     rows = run_cases(cases, lambda case: partial(_run, path, case), workers, progress, journal, code, resume)
