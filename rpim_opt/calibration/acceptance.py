@@ -414,8 +414,6 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
 
 def _standing(result: Calibration) -> str:
     """Return a sentence on joints of the robot that hardly moved; empty if all did."""
-    if len(result.ranges) > 1:
-        return ""
     (measured,), (robot,) = result.ranges.values(), result.problem.arms.values()
     least = np.array([LEAST_TRAVEL[robot.joint_types[i]] for i in robot.leading])
     still = [str(i + 1) for i in np.flatnonzero(np.ptp(measured, axis=0) < least)]

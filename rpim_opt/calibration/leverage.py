@@ -108,9 +108,8 @@ def influence(result: Outcome) -> Influence:
     moving = np.array([name not in at_bound for name in free.names])
     gradient = A.T @ (A @ result.z - b) + L.T @ (L @ result.z - c)
     if np.linalg.norm(gradient[moving]) > BALANCED * np.linalg.norm(A.T @ b):
-        accepted = "a squared loss, or a robust one that is reweighted squares (Huber's)"
-        if formulation.constraints and result.program.box is None:
-            accepted = f"{accepted}; and no active constraints other than bounds"
+        squares = "a squared loss, or a robust one that is reweighted squares (Huber's)"
+        accepted = f"{squares}; and no active constraints other than bounds"
         raise InputError("influence", f"formulation '{formulation.name}'", accepted)
     T = np.zeros((len(free), len(A) + len(L)))  # H^-1 = T T'
     T[moving] = np.linalg.pinv(np.vstack([A, L])[:, moving], rcond=RANK_TOLERANCE)

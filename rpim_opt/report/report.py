@@ -131,7 +131,7 @@ def _headline(content: Content) -> Iterator[Block]:
             share = percent(accepted.requirement.confidence)
             U = f"expanded uncertainty of the position that the reflector reaches (U, {share})"
             text = f"{U} at most {1e3 * accepted.bound:.3f} mm, {text}"
-        if _beyond_geometry(result):
+        if any(beyond_geometry(result).values()):
             text += " It holds for the whole model, as `compensate` uses it; files with geometry alone have another U."
         yield "verdict", {"kind": accepted.verdict, "word": word, "text": text}
     elif result.verdict.delivered:
@@ -153,11 +153,6 @@ def _headline(content: Content) -> Iterator[Block]:
         note = f"{percent(content.map.requirement.confidence)}, maximum over the region"
         cards.append(("Expanded uncertainty U", "after", mm(1e3 * content.map.largest), note))
     yield "cards", cards
-
-
-def _beyond_geometry(result: Calibration) -> bool:
-    """Return whether the model has what files for controllers do not hold."""
-    return any(value for robot in result.robots for value in beyond_geometry(result, robot).values())
 
 
 def _mean_interval(errors: Array) -> str:
@@ -293,9 +288,10 @@ def _parameters(content: Content) -> Iterator[Block]:
         rows.append([f"{name} [{printed(unit)}]{edge}", *figures, expanded, allowed][:columns])
     yield "text", words.weight_lines(result)
     files = "Exported files hold the geometry of a separate fit without model extensions, with other values than these."
+    separate = [files] * any(beyond_geometry(result).values())
     tool = f"tool_x ... tool_rz: pose of the reflector in {FLANGE}."
     tools = [tool] * any(own_name(name).startswith("tool_") for name in free.names)
-    yield "text", [note, *tools, *words.turned_frames(result), *([files] if _beyond_geometry(result) else [])]
+    yield "text", [note, *tools, *words.turned_frames(result), *separate]
     count = Counter(np.array(own.dimensions)[~own.of_frames].tolist())
     drawn = []
     for dimension in ("length", "angle"):

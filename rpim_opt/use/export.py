@@ -83,7 +83,8 @@ def identified(result: Calibration, marker: str | None = None, robot: str = "") 
     joint_map = arm.joint_map.copy()
     for i in set(range(len(joint_map))) - set(arm.leading):
         joint_map[i] *= 1 + of[f"ratio{i + 1}"]
-    extras = [name for name, value in beyond_geometry(result, robot).items() if value]
+    beyond = beyond_geometry(result)
+    extras = [name for name in np.array(whole.names)[whole.places_of(robot)].tolist() if beyond.get(name)]
     if extras:
         accepted = "MDH parameters, base and tool: `export_files` fits these alone, `compensate` uses all parameters"
         raise InputError("the calibration", listed(extras, 6), accepted)
@@ -94,17 +95,18 @@ def identified(result: Calibration, marker: str | None = None, robot: str = "") 
     return RobotSetup(replace(arm, joint_map=joint_map), frame_numbers(base_frame(result, robot)), tool)
 
 
-def beyond_geometry(result: Calibration, robot: str) -> dict[str, float]:
-    """Return the values [SI] of a robot's parameters that no description of it holds, by name: those of terms.
+def beyond_geometry(result: Calibration) -> dict[str, float]:
+    """Return the values [SI] of the parameters that no description of a robot holds, by name: those of terms.
 
     Ratios (but of joints that follow others: files hold their multipliers), harmonics, backlash, compliances, bends,
     terms of a user's own; and origins, which only a URDF holds.
     """
-    p, arm = result.problem.parameters, result.robots[robot]
-    values = p.by_name(result.x)
-    held = [p.called(robot, f"ratio{i + 1}") for i in range(len(arm.joint_map)) if i not in arm.leading]
-    terms = {name for name in p.names if of_term(name) or name in p.terms}.difference(held)
-    return {name: values[name] for name in np.array(p.names)[p.places_of(robot)].tolist() if name in terms}
+    p = result.problem.parameters
+    beyond = {name: x for name, x in p.by_name(result.x).items() if of_term(name) or name in p.terms}
+    for robot, arm in result.problem.arms.items():
+        for i in set(range(len(arm.joint_map))) - set(arm.leading):
+            beyond.pop(p.called(robot, f"ratio{i + 1}"), None)
+    return beyond
 
 
 def export_files(
@@ -223,10 +225,8 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     The geometry of the whole model is not the best one without extensions and terms of a user's own: the same rows are
     calibrated once more, also those that only they explain. Returned as it is where they are zero.
     """
-    beyond: dict[str, float] = {}
-    for robot in result.robots:
-        own = beyond_geometry(result, robot)
-        beyond |= {name: own[name] for name in own if not own_name(name).startswith(OF_JOINTS)}
+    every = beyond_geometry(result)
+    beyond = {name: every[name] for name in every if not own_name(name).startswith(OF_JOINTS)}
     if not any(beyond.values()):
         return result, []
     free = result.problem.parameters.free.names
