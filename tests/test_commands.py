@@ -365,7 +365,7 @@ def test_names_that_people_use() -> None:
     names = {
         "J1 [deg]": "q1_deg", "axis_2(rad)": "q2_rad", "joint03": "q3_rad", "Theta_4": "q4_rad", "q5": "q5_rad",
         "A6 degrees": "q6_deg", "X": "x_mm", "measured_y": "y_mm", "pos_z (m)": "z_m", "quat_w": "qw", "Name": "label",
-        "reflector": "marker", "sigma_mm": "sigma_mm", "effort_1": "tau1_Nm",
+        "reflector": "marker", "sigma_mm": "sigma_mm", "torque_1": "tau1_Nm",
     }  # fmt: skip
     source = {name: ["1"] for name in (*names, "temperature", "timestamp")}
     found = understand(RawTable(source), ARM, pose, TableOptions(units=parse_units("rad,mm,Nm")), targets=True)

@@ -184,6 +184,26 @@ def test_a_joint_of_another_robot_is_no_joint_of_this_one(tmp_path: Path) -> Non
     assert found.columns["q2_deg"] == ["2", "4"]
 
 
+def test_efforts_follow_the_names_of_joints_and_are_torques_where_that_is_said(tmp_path: Path) -> None:
+    """Without a unit they may be currents, and of some joints they are no torques of the robot."""
+    head = "name0,name1,name2,position0,position1,position2,effort0,effort1,effort2,x_mm,y_mm,z_mm\n"
+    path = write(
+        tmp_path, head + "foot,gripper,elbow,1,9,2,10,90,20,401,5,6\nfoot,gripper,elbow,3,9,4,30,90,40,402,6,7\n"
+    )
+    asked: dict[str, Any] = {"joints": ("elbow", "foot"), "units": {"angle": "deg"}}
+    why = {each.column: each.why for each in read(path, **asked).meant if each.meaning == "not used"}
+    assert why["effort0"] == why["effort2"] == "an effort without a unit: --units Nm if it is a torque"
+    asked["units"] = {"angle": "deg", "torque": "Nm"}
+    found = read(path, **asked)
+    assert [found.columns[f"tau{i}_Nm"] for i in (1, 2)] == [["20", "40"], ["10", "30"]]
+    assert "tau3_Nm" not in found.columns
+    assert len(ro.read_data(found.columns, ARM, {"position_mm": 0.1})) == 2
+    path = write(tmp_path, path.read_text().replace("effort2", "other"))
+    found = read(path, **asked)
+    assert {each.column: each.why for each in found.meant}["effort0"] == "not all joints have an effort"
+    assert len(ro.read_data(found.columns, ARM, {"position_mm": 0.1})) == 2
+
+
 @pytest.mark.parametrize(
     ("cells", "joints", "said"),
     [

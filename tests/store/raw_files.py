@@ -267,9 +267,10 @@ RAW: dict[str, Shape] = {
     ),
     "ROS, rostopic": one(
         text([["%time", "field.header.seq", *joint_names("field.name{}", 0), *joint_names("field.position{}", 0),
+               *joint_names("field.effort{}", 0),
                "field.pose.position.x", "field.pose.position.y", "field.pose.position.z"]],
              beside(TIMES, [["7"]] * COUNT, [[f"{UR[i]}_joint" for i in ORDER]] * COUNT,
-                    [[row[i] for i in ORDER] for row in RADIANS], METRES)),
+                    [[row[i] for i in ORDER] for row in RADIANS], [["1.5"] * 6] * COUNT, METRES)),
     ),
     "ROS, by path": one(
         text([["__time", *(f"/joint_states/{UR[i]}_joint/position" for i in ORDER),

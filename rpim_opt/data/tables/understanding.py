@@ -176,6 +176,8 @@ def _readings(
     for stems in ({f"q{i}" for i in range(1, dof + 1)}, COORDINATES):
         read.update(_without_prefix(read, stems, joints, options.prefix))
     _counted(read, robot)
+    torques = {f"tau{i}" for i in range(1, dof + 1)}
+    whole = torques <= {each.stem for each in read.values()}
     for name, each in read.items():
         if ANOTHER_POINT.fullmatch(each.stem):
             raise InputError("the header", f"column '{name}', another point", "one row per point, with a column marker")
@@ -186,6 +188,11 @@ def _readings(
         wanted = {*options.units, *robot.model.columns}
         if each.stem == "temperature" and not each.unit and "temperature" not in wanted:
             read[name] = Reading("", "", "a temperature without a unit")
+        effort = "effort" in name and each.stem in torques
+        if effort and not each.unit and wanted.isdisjoint({each.stem, "tau", "torque"}):
+            read[name] = Reading("", "", "an effort without a unit: --units Nm if it is a torque")
+        elif effort and not whole:
+            read[name] = Reading("", "", "not all joints have an effort")
     _leave_out(read, targets)
     _choose_label(read, table, options.key)
     return read, rotation
@@ -232,7 +239,7 @@ def _read(name: str, group: str, known: Sequence[str], names: Sequence[str], joi
 
 
 def _put_in_robots_order(read: Readings, table: Columns, dof: int, joints: Sequence[str]) -> None:
-    """Put ROS' joints in the robot's order, where columns name0, ... name them."""
+    """Put ROS' joints and their efforts in the robot's order, where columns name0, ... name them."""
     matches = {name: re.fullmatch(r"(?:field_)?name_?(\d{1,9})", reading.stem) for name, reading in read.items()}
     named = {int(match[1]): name for name, match in matches.items() if match}
     if not named or f"q{min(named)}" not in {reading.stem for reading in read.values()}:
@@ -248,7 +255,7 @@ def _put_in_robots_order(read: Readings, table: Columns, dof: int, joints: Seque
         if not joints and not place:
             accepted = "a robot from a URDF, which names its joints"
             raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
-        new[f"q{i}"] = f"q{place}" if place else f"another q{i}"
+        new |= {f"{stem}{i}": f"{stem}{place}" if place else f"another {stem}{i}" for stem in ("q", "tau")}
     _rename(read, new, "the joint named in its name column")
 
 
