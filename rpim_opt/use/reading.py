@@ -72,11 +72,11 @@ def read_targets(
         targets = _targets(robot, understanding)
     angles = ("rx", "ry", "rz", "qw,")
     turned = [each for table in understanding.tables for each in table.meant if each.name.startswith(angles)]
+    notes = [*understanding.notes, *_perhaps_radians(result, understanding, targets.q)]
     if turned:
         meant = ", ".join(f"{each.column}: {each.meaning.removeprefix('measured ')}" for each in turned)
-        notes = (*understanding.notes, f"Orientation of targets: {meant}.")
-        understanding = replace(understanding, notes=notes)
-    return targets, understanding
+        notes.append(f"Orientation of targets: {meant}.")
+    return targets, replace(understanding, notes=tuple(notes))
 
 
 def _targets(robot: Robot, understanding: Understanding) -> Targets:
@@ -170,11 +170,21 @@ def read_measurements(
     left_out = tuple(column for column in understanding.left_out if column.lower() != name)
     lost = re.compile(r"rows without|line \d|\d+ more lines")
     notes = [f"{each.file}: {note}" for each in understanding.tables for note in each.notes if lost.match(note)]
-    notes += understanding.notes
+    notes += [*understanding.notes, *_perhaps_radians(result, understanding, data.q)]
     if register:
         data, motion = registered_again(result, data)
         notes.append(motion)
     return Measured(data, left_out, tuple(notes), clock)
+
+
+def _perhaps_radians(result: Calibration, understanding: Understanding, q: Array | None) -> list[str]:
+    """Return a remark on joint values (N, dof) of three or more rows in degrees that radians would explain."""
+    turning = [f"q{i}_deg" in understanding.columns for i in range(1, result.problem.robot.dof + 1)]
+    if q is None or len(q) < 3 or not any(turning):
+        return []
+    now, then = (float(np.degrees(np.abs(each[:, turning]).max())) for each in (q, next(iter(result.ranges.values()))))
+    said = f"Joint values are within {now:.3g} deg of zero, those of the calibration within {then:.3g} deg: if they are"
+    return [f"{said} in radians, name the columns q1_rad, ..."] * (now <= 2 * np.pi < then)
 
 
 def _understood(

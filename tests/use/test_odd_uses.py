@@ -176,6 +176,25 @@ def test_targets_that_are_none(table: dict[str, Any], said: str) -> None:
     assert said in str(error.value)
 
 
+def test_degrees_that_are_radians_are_remarked_on() -> None:
+    """Of three rows or more, since a few targets may all be near zero."""
+    q = np.random.default_rng(4).uniform(-2, 2, (3, 6))
+    table = {f"q{i}_deg": column for i, column in enumerate(q.T, start=1)}
+    readings = table | {name: [1.0, 2.0, 3.0] for name in PLACES}
+    said = "if they are in radians, name the columns q1_rad, ..."
+    for notes in (
+        ro.use.read_targets(calibrated(), table)[1].notes,
+        ro.use.read_measurements(calibrated(), readings).notes,
+    ):
+        assert len([note for note in notes if note.endswith(said)]) == 1
+    for other in (
+        {name: cells[:2] for name, cells in table.items()},
+        {name: np.degrees(cells) for name, cells in table.items()},
+        {name.replace("deg", "rad"): cells for name, cells in table.items()},
+    ):
+        assert not ro.use.read_targets(calibrated(), other)[1].notes
+
+
 def test_a_table_of_another_kind_or_with_a_numbered_quaternion_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match="measurement: found 'pose'"):
         ro.use.read_measurements(calibrated(), {**Q, **PLACES}, "pose")
