@@ -95,7 +95,7 @@ def new_problem(
 
     ``folder`` is a new one, or for one more chain one whose problem file has chains of the same URDF. ``robot`` is the
     name of a ready robot, or a file, ``data`` are text, Excel or Parquet files. ``measurement`` is what was measured,
-    by default poses where the tables have orientations, else positions; ``options`` are what is stated of the tables.
+    by default poses, positions or distances, as the columns are; ``options`` are what is stated of the tables.
     ``urdf_base`` and ``urdf_tip`` are links between which a URDF's robot is, ``dh`` the convention of a DH table,
     ``"modified"`` or ``"standard"``, where it states none (`read_sheet`).
 

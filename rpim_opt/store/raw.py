@@ -16,6 +16,7 @@ from rpim_opt.basics.layout import RawTable, TableOptions
 from rpim_opt.basics.tables import EXCEL, Columns, read_columns
 from rpim_opt.basics.units import UNITS, split
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.measurements.distance import cable, distance
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.measurements.registry import MEASUREMENTS
@@ -131,17 +132,19 @@ def understand_of(
     if known is None:
         columns = [raw.columns for _, raw in files]
         known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
-    for kind in [known] if known else (pose, position):
+    for kind in [known] if known else (pose, position, distance, cable):
         tables = _tables(files, arm, kind, options, targets)
         stems = set().union(*(each.stems for each in tables))
-        if known or any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms))):
+        forms = [form for form, _ in kind.forms]
+        lacking = kind.points == 2 and not any(stem.startswith("to_") for stem in stems)
+        if known or (not lacking and any(set(form) <= stems for form in (kind.columns, *forms))):
             understanding = _whole(files, arm, kind, options, tables)
             wanted = ("rotation",) * ("q1" in stems) if targets else tuple(READINGS)
             doubt = next((each.doubt for each in tables if each.doubt in wanted and kind.turning), "")
             return _checked(understanding, files, arm, doubt, targets) if doubt else understanding
     names = ", ".join(name for _, raw in files for name in raw.columns)
     sheets = [note.rstrip(".") for _, raw in files for note in raw.notes if note.startswith("sheet '")]
-    accepted = "; ".join([f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}", *sheets])
+    accepted = "; ".join(["columns x, y, z or distance, or --measurement plane or sphere (touched)", *sheets])
     raise InputError("the header", f"no positions among {names}", accepted, files[0][0])
 
 

@@ -121,6 +121,23 @@ def test_commanded_joints_serve_where_none_were_measured_and_it_is_said(monkeypa
     assert "no positions among" in capsys.readouterr().err
 
 
+def test_distances_alone_are_those_of_a_cable(monkeypatch, capsys, tmp_path, arm) -> None:
+    """Unless a second point has columns, without which distances between points are refused."""
+    path, distances = tmp_path / "raw.csv", [[f"{np.linalg.norm(p) + 40:.4f}"] for p in P]
+    path.write_text(text([[*HEAD[:7], "distance [mm]"]], beside(NAMED, JOINTS, distances)))
+    assert new(monkeypatch, arm, tmp_path / "between", path, "--measurement", "distance") == 2
+    assert "measurement cable for distances to a fixed anchor" in capsys.readouterr().err
+    assert new(monkeypatch, arm, tmp_path / "cable", path) == 0
+    assert "Measurement cable: guessed from the columns distance." in capsys.readouterr().out
+    to = [f"to_q{i}_deg" for i in range(1, 7)]
+    path.write_text(text([[*HEAD[:7], *to, "distance [mm]"]], beside(NAMED, JOINTS, cells(Q[::-1]), distances)))
+    assert new(monkeypatch, arm, tmp_path / "two", path) == 0
+    assert "Measurement distance: guessed" in capsys.readouterr().out
+    path.write_text(text([HEAD[:7]], beside(NAMED, JOINTS)))
+    assert new(monkeypatch, arm, tmp_path / "none", path) == 2
+    assert "accepted: columns x, y, z or distance, or --measurement plane" in capsys.readouterr().err
+
+
 def test_what_was_understood_is_said_before_the_folder_is_made(monkeypatch, capsys, tmp_path, arm) -> None:
     """Also where the values then turn out to be unusable: the table is what explains it."""
     bad = [[*row] for row in ROWS]

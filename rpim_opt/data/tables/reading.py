@@ -90,8 +90,8 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     markers = [first, texts(table.get("to_marker", first), "to_marker")][: kind.points]
     for i in range(N if kind.points == 2 else 0):
         if markers[0][i] == markers[1][i] and np.array_equal(q[i, 0], q[i, 1]):
-            found = "the same reflector twice in one configuration"
-            raise InputError(f"row {label[i]}", found, "to_marker or to_q1, ... of another point")
+            accepted = "to_marker or to_q1, ... of another point; measurement cable for distances to a fixed anchor"
+            raise InputError(f"row {label[i]}", "the same reflector twice in one configuration", accepted)
     marker = np.column_stack(markers) if {"marker", "to_marker"} & set(table) else ()
     stated |= {"marker": marker, "fixture": texts(table.get("fixture", ()), "fixture")}
     data = Dataset.of(q, y, noise, label, kind, columns=further, session=session, point=point, **stated)
