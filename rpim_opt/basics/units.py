@@ -23,7 +23,7 @@ class Unit(NamedTuple):
 DIMENSIONS = {
     "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "cm": 1e-2, "in": 0.0254},
     "length2": {"m2": 1.0, "mm2": 1e-6, "um2": 1e-12},
-    "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "gon": math.pi / 200},
+    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "urad": 1e-6, "gon": math.pi / 200},
     "angle2": {"rad2": 1.0, "mrad2": 1e-6},
     "length angle": {"m_rad": 1.0, "mm_mrad": 1e-6},
     "torque": {"Nm": 1.0},

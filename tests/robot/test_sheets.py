@@ -56,6 +56,13 @@ def test_a_standard_table_reaches_the_same_poses(tmp_path: Path, beta: np.ndarra
         assert np.abs(T - truth).max() < 1e-12
 
 
+def test_an_unknown_angle_of_a_sheet_is_offered_in_its_own_unit(tmp_path: Path) -> None:
+    path = tmp_path / "arm.csv"
+    path.write_text(sheet().replace("theta", "theta0"), encoding="utf-8")
+    with pytest.raises(ro.InputError, match=r"unknown key 'theta0_deg'.*did you mean theta_deg"):
+        read_sheet(path, "standard")
+
+
 def test_a_table_that_does_not_say_its_convention_is_asked_for(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     Path("dh.csv").write_text(sheet())
