@@ -410,7 +410,8 @@ def validate(
 
     Exit code 1 if an error is above the limit, the errors are significantly larger than those of the nominal robot
     (mean difference of their squares above three standard errors), or an input mistake is likely, a moved instrument
-    or base among them.
+    or base among them; 4 if no error is above the limit but fewer coordinates are inside their prediction intervals
+    than chance lets be.
     """
     console.require_positive("--limit", limit)
     with _loaded(result) as (loaded, _):
@@ -420,9 +421,11 @@ def validate(
         limit = 1e3 * loaded.record.requirement.limit
     text, within = _against(limit, "error", validation.largest)
     document = {**validation.content(), "limit_mm": limit, "within_limit": within}
-    failed = within is False or validation.failure
+    code = int(within is False or bool(validation.failure))
+    if within and not code and validation.uncovered:
+        code = CODES["inconclusive"]
     written = console.written_to(out, validation.csv())
-    return Answer("\n".join([str(validation), *text]), document, int(bool(failed)), written, read)
+    return Answer("\n".join([str(validation), *text]), document, code, written, read)
 
 
 @command

@@ -415,6 +415,13 @@ def test_a_saved_result_on_new_measurements(monkeypatch, capsys, cell, made, tmp
     assert run(monkeypatch, "validate", str(tmp_path / "limited.json"), *arguments[2:]) == 1
     assert "above the limit of 0.01 mm" in capsys.readouterr().out  # that of the result
     assert run(monkeypatch, "validate", str(tmp_path / "limited.json"), *arguments[2:], "--limit", "0.1") == 0
+    header, rows = table(cell / "later.csv")
+    rows[:, :3] += np.random.default_rng(0).normal(0.0, 1e-4, (len(rows), 3))
+    np.savetxt(tmp_path / "scattered.csv", rows, delimiter=",", header=",".join(header), comments="")
+    capsys.readouterr()
+    arguments[2] = str(tmp_path / "scattered.csv")
+    assert run(monkeypatch, *arguments, "--limit", "1") == 4  # within a limit by intervals that do not hold
+    assert "within the limit of 1 mm" in capsys.readouterr().out
 
 
 def test_a_row_that_the_prediction_does_not_allow_is_named(monkeypatch, capsys, cell, made, tmp_path) -> None:

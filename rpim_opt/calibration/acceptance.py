@@ -430,7 +430,8 @@ def _rows_apart(result: Calibration, data: Dataset | None) -> tuple[Dataset, Hel
         if not used.keys() >= set(apart.label):
             apart = apart.without(used) if used else apart
             held = held_out_errors(result, apart)
-            return apart, held, [], "".join(displacement(result, apart, held))
+            mistake, remark = displacement(result, apart, held)
+            return apart, held, [], f"{mistake} `validate` compares the two." if mistake else remark
         if held is not None and not set(held.label).issuperset(used.values()):
             return None
     if held is None:

@@ -69,9 +69,9 @@ def displacement(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str
     place = registration(result.problem.parameters.free, data)
     if far and after <= before / 2:
         return (
-            f"Likely: the instrument or the base moved. {said} Use --register in `validate`, `monitor` and `accept`, "
-            f"or recalibrate by `update --reset '{place}*'`; do not add such rows to the problem's folder. If neither "
-            "moved, the robot has a common error at these configurations."
+            f"{said} If the instrument or the base moved, use --register in `validate`, `monitor` and `accept`, or "
+            f"recalibrate by `update --reset '{place}*'`; do not add such rows to the problem's folder. If neither "
+            "moved, the robot changed, and --register would hide that."
         ), ""
     if fdtrc(6, freedom, (squares - left) / 6 / (left / freedom)) < UNLIKELY:
         return "", f"{said} If the instrument was moved since the calibration, use --register."

@@ -43,7 +43,8 @@ REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint
 """Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise; a service robot had 5.3 mrad."""
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
-UNUSUAL_LENGTH = 0.004  # deviation of a length [m] from which on another robot or a wrong frame is the likelier reason
+UNUSUAL = {"length": 0.004, "angle": 0.05}
+"""Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
 ALIKE = 0.999  # cosine of two parameters' effects on the data from which on these do not distinguish them
 EXCLUDED = 0.25  # share of the rows that may be outliers
 COMPUTED, COMPUTED_RMS = 0.05, 2e-5  # nominal RMS over the stated noise, and itself [m], of computed positions
@@ -140,14 +141,15 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
 
 
 def _like_a_frame(result: Outcome) -> str:
-    """Return a sentence if errors of a frame look to the data like the largest deviation of one of the robot's lengths.
+    """Return a sentence if errors of a frame look to the data like the largest deviation of the robot.
 
-    A wrong length of a stated tool is a deviation of the last d.
+    A wrong length of a stated tool is a deviation of the last d, a wrong direction one of the last theta.
     """
     p = result.problem.parameters
-    of_arm = (np.array(p.free.dimensions) == "length") & ~p.of_frames[p.identified]
-    worst = int(np.argmax(np.abs(result.x) * of_arm))
-    if not result.problem.keeps_rows or abs(result.x[worst]) * of_arm[worst] < UNUSUAL_LENGTH:
+    least = [UNUSUAL.get(dimension, np.inf) for dimension in p.free.dimensions]
+    size = np.where(p.of_frames[p.identified], 0.0, np.abs(result.x) / least)
+    worst = int(size.argmax())
+    if not result.problem.keeps_rows or size[worst] < 1:
         return ""
     framed = cast(CalibrationProblem, result.problem).identifying(p.identified | p.of_frames)
     x = np.zeros(len(p))
@@ -160,7 +162,7 @@ def _like_a_frame(result: Outcome) -> str:
     if not frames:
         return ""
     return (
-        f"{name} deviates by {in_unit(result.x[worst], 'length')}, which the data do not distinguish from an error of "
+        f"{name} deviates by {in_unit(result.x[worst], p.free.dimensions[worst])}, which the data do not distinguish from an error of "
         f"the stated {joined(frames)}: check it. If it is wrong, this robot is right only together with it."
     )
 
@@ -549,7 +551,7 @@ def _other_robot(result: Outcome, problem: CalibrationProblem) -> Better | None:
     """Return the ready robot that fits far better, sought where a length of the arm is not machined as stated."""
     free = problem.parameters.free
     lengths = (np.array(free.dimensions) == "length") & ~free.of_frames
-    if len(problem.arms) > 1 or not (np.abs(result.x[lengths]) > UNUSUAL_LENGTH).any():
+    if len(problem.arms) > 1 or not (np.abs(result.x[lengths]) > UNUSUAL["length"]).any():
         return None
     return sibling(problem)
 

@@ -374,15 +374,16 @@ def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple
     moved = displacement(result, data, held)
     place = registration(result.problem.parameters.free, data)
     placed_by = {place + axis for axis in FRAME} <= set(result.problem.parameters.free.names)
+    likely = moved[0] and f"Likely: the instrument or the base moved. {moved[0]}", moved[1]
     if not any(moved) or not placed_by or result.known_covariance is None or not result.problem.keeps_rows:
-        return moved
+        return likely
     causes, fit = _changes(result, data)
     again, registered_fit = _changes(result, registered(result, data)[0])
     best, *others = [cause for cause in causes if cause.kind != "reading"]
     base = next(cause for cause in again if cause.members[0].startswith(place))
     left, motion = fit.squares - best.gain, registered_fit.squares - base.gain
     if motion - left <= AS_GOOD:
-        return moved
+        return likely if left - motion > AS_GOOD else moved
     names = [best.name, *(cause.name for cause in others if cause.gain > best.gain - AS_GOOD)]
     return (
         f"Likely: {', or '.join(names)} changed: that leaves chi-squared {three_digits(left)} of "

@@ -14,7 +14,7 @@ from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.held_out import coverage_text
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import held_out_errors, unregistered
+from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage, unregistered
 from rpim_opt.calibration.verdict import implausible, misread, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset
@@ -57,6 +57,11 @@ class Validation(HeldOut):
     def failure(self) -> str:
         """Why the calibration fails on these measurements; empty where it does not."""
         return self.mistake or self.worse
+
+    @property
+    def uncovered(self) -> bool:
+        """Whether fewer coordinates are inside their prediction intervals than chance lets be."""
+        return self.coverage is not None and self.coverage < required_coverage(len(self.label))
 
     @property
     def beyond(self) -> tuple[int, ...]:
