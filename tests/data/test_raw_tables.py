@@ -221,11 +221,13 @@ def test_names_of_joints_that_change_or_that_nobody_knows(tmp_path: Path, cells:
     assert said in error.value.command
 
 
-def test_q0_to_q3_are_a_quaternion_where_other_columns_are_all_joints(tmp_path: Path) -> None:
-    """And joints where no others are there."""
+def test_q0_to_q3_are_a_quaternion_where_they_cannot_be_the_joints(tmp_path: Path) -> None:
+    """Other columns are, or another file has them; joints where no others are there."""
     text = "Point,J1 [deg],J2 [deg],X [mm],Y [mm],Z [mm],Q0,Q1,Q2,Q3\nP1,1,2,401,5,6,1,0,0,0\nP2,3,4,402,6,7,1,0,0,0\n"
     found = read(write(tmp_path, text), kind=pose)
     assert [found.columns[name] for name in ("qw", "qx", "q1_deg")] == [["1", "1"], ["0", "0"], ["1", "3"]]
+    found = read(write(tmp_path, "Point,X [mm],Y [mm],Z [mm],Q0,Q1,Q2,Q3\nP1,401,5,6,1,0,0,0\n"), kind=pose)
+    assert [found.columns[name] for name in ("x_mm", "qw", "qz")] == [["401"], ["1"], ["0"]]
     four = ro.robot.Robot("four", np.array([[0, 0.1, 0, 0, 0]] * 4))
     text = "Point,Q0 [deg],Q1 [deg],Q2 [deg],Q3 [deg],X [mm],Y [mm],Z [mm]\nP1,1,2,3,4,401,5,6\n"
     found = read(write(tmp_path, text), robot=four)

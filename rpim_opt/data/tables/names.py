@@ -200,7 +200,7 @@ def _entries(read: Readings) -> dict[str, tuple[int, int]]:
 
 
 def quaternion_columns(read: Readings, dof: int) -> list[str]:
-    """Return the four numbered columns of a quaternion, in order; ``q0 ... q3`` where other columns are the joints."""
+    """Return the four numbered columns of a quaternion, in order; ``q0 ... q3`` where these cannot be joints."""
     components: dict[str, dict[int, str]] = {}
     for name in read:
         match = QUATERNION.fullmatch(name.strip().lower())
@@ -210,7 +210,8 @@ def quaternion_columns(read: Readings, dof: int) -> list[str]:
         if sorted(columns) in ([0, 1, 2, 3], [1, 2, 3, 4]):
             others = {each.stem for name, each in read.items() if name not in columns.values()}
             counted = any(all(f"q{i + first}" in others for i in range(dof)) for first in (0, 1))
-            if prefix != "q" or counted:
+            joints = dof == len(columns) or any(re.fullmatch(r"q\d+", stem) for stem in others)
+            if prefix != "q" or counted or ({"x", "y", "z"} <= others and not joints):  # these are in another file
                 return [columns[i] for i in sorted(columns)]
     return []
 
