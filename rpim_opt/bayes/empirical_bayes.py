@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Estimator, ExcludedRow, Fit, Learned, Trial, learned, sampled
 from rpim_opt.bayes.model_selection import select_model
@@ -42,16 +43,23 @@ class Estimated:
     x: Array
 
 
-def estimate(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Estimated:
-    """Estimate hyperparameters, outliers, and of the model ``"auto"`` extensions, from a start (n,) [SI] or None."""
+def estimate(
+    problem: Source, estimator: Estimator, model: str, start: Array | None, keep: Callable[[], bool] = lambda: False
+) -> Estimated:
+    """Estimate hyperparameters, outliers, and of the model ``"auto"`` extensions, from a start (n,) [SI] or None.
+
+    Outliers are left out of the problem, unless the loss has to ``keep`` the rows that it knows.
+    """
     try:
-        return _estimate(problem, estimator, model, start)
+        return _estimate(problem, estimator, model, start, keep)
     except np.linalg.LinAlgError:
         found = "magnitudes of equations, scales and noise too different to estimate hyperparameters"
         raise InputError("data", found, "correct units, or a fixed weight") from None
 
 
-def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Estimated:
+def _estimate(
+    problem: Source, estimator: Estimator, model: str, start: Array | None, keep: Callable[[], bool]
+) -> Estimated:
     every = sampled(problem)
     p = every.parameters
     if start is None:  # frames registered to the data, the robot nominal
@@ -82,7 +90,12 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
         errors = dict(zip(laid.labels, largest_errors(laid, fit.x), strict=True))
         for label, ratio in sorted(outliers.items(), key=lambda item: -item[1]):
             left_out.append(ExcludedRow(label, ratio, *errors[label]))
-        laid = laid.without(outliers)
+        if keep():
+            kept = listed([str(row) for row in left_out], 5)
+            notes += (f"Outliers, kept because the loss depends on the order of its equations: {kept}.",)
+            left_out = []
+        else:
+            laid = laid.without(outliers)
     hyperparameters = learned(
         fit,
         gain,

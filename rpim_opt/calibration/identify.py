@@ -23,6 +23,7 @@ from rpim_opt.calibration.certificate import DECREASE
 from rpim_opt.calibration.loop import FAR, ROUNDS, Ended, Iteration, Options, minimize, nearby
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation, formulation_of, tikhonov
+from rpim_opt.convex.robust_loss import by_place
 from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.convex.select import weight_of
 from rpim_opt.problem.blocks import Source
@@ -167,7 +168,8 @@ def calibrate(
     learned = None
     excluded = None
     if weight is None:
-        estimated = estimate(problem, estimator, model, start)
+        groups = problem.groups if isinstance(problem, CalibrationProblem) else np.zeros(1)
+        estimated = estimate(problem, estimator, model, start, partial(by_place, formulation, groups))
         left_out = [row.label for row in estimated.learned.left_out]
         if left_out and isinstance(problem, CalibrationProblem):  # in memory
             excluded = problem.data.take(np.flatnonzero(np.isin(problem.labels, left_out)))

@@ -18,6 +18,7 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage, unregistered
 from rpim_opt.convex.constraints import name_of
 from rpim_opt.convex.program import pose
+from rpim_opt.convex.robust_loss import by_place
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
 from rpim_opt.problem import diagnosis
@@ -162,8 +163,9 @@ def _like_a_frame(result: Outcome) -> str:
     if not frames:
         return ""
     return (
-        f"{name} deviates by {in_unit(result.x[worst], p.free.dimensions[worst])}, which the data do not distinguish from an error of "
-        f"the stated {joined(frames)}: check it. If it is wrong, this robot is right only together with it."
+        f"{name} deviates by {in_unit(result.x[worst], p.free.dimensions[worst])}, which the data do not distinguish "
+        f"from an error of the stated {joined(frames)}: check it. If it is wrong, this robot is right only together "
+        "with it."
     )
 
 
@@ -533,10 +535,16 @@ def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: 
     outliers = set() if result.squared_loss else {flag.label for flag in flagged(rows, ridge_deviations(rows))}
     if outliers:  # they bias the squares with which the fit is compared, and losses that are not robust
         rows = rows.without(outliers)
-        again = pose(result.formulation, rows.linearize(x)).solve(result.weight)
-        x = rows.parameters.free.scale * again.z
-    before, now, plain = (_worst_ratio(rows, each) for each in (result.x, x, ridge_deviations(rows)))
-    if plain > NOISY or now < max(NOTICED * plain, before / NOISY):  # or outliers limited it
+    plain = _worst_ratio(rows, ridge_deviations(rows))
+    if plain > NOISY:
+        return []
+    away = sorted(set(problem.labels).difference(rows.labels))
+    if away and by_place(result.formulation, problem.groups):
+        return [f"outliers bias a loss that depends on the order of its equations: leave out {listed(away)}."]
+    if outliers:
+        x = rows.parameters.free.scale * pose(result.formulation, rows.linearize(x)).solve(result.weight).z
+    before, now = (_worst_ratio(rows, each) for each in (result.x, x))
+    if now < max(NOTICED * plain, before / NOISY):  # outliers limited it
         return []
     names = [name_of(constraint, k) for k, constraint in enumerate(result.formulation.constraints)]
     remedy = f"Loosen its constraints ({joined(names)}) or use" if names else "Use"

@@ -328,7 +328,7 @@ class Term:
         """Return the gradient (n,), None where CVXPY knows none, or outside the domain."""
         with self._lock:
             self.variable.save_value(value)
-            gradient = None
+            gradient: Any = None
             # atoms without a gradient raise NotImplementedError (norm_inf) or, by a fault in CVXPY, ValueError (cummax)
             with np.errstate(all="ignore"), contextlib.suppress(NotImplementedError, ValueError):
                 gradient = self.expression.grad.get(self.variable)

@@ -110,6 +110,19 @@ def inliers_of(formulation: Formulation, norms: Array, count: np.ndarray, loss: 
     return Inliers(noise, len(norms), factor)
 
 
+def by_place(formulation: Formulation, groups: np.ndarray) -> bool:
+    """Whether a loss of residuals (m,), or of the norms of their ``groups``, changes where these are exchanged."""
+    if formulation.ready:
+        return False
+    size = len(groups if formulation.loss_over == "equation" else np.unique(groups))
+    r = np.linspace(0.5, 1.5, size)
+    loss = term(formulation.loss, size, f"formulation '{formulation.name}', loss")
+    if len(loss.expression.variables()) > 1:  # own ones, which have no values here
+        return False
+    one, other = loss(r), loss(np.random.default_rng(0).permutation(r))
+    return bool(np.isfinite(one) and abs(one - other) > SEPARATE * abs(one))
+
+
 # --- blocks of rows ---
 
 

@@ -285,6 +285,34 @@ def test_outliers_that_bias_a_loss_of_ones_own_are_named_and_not_the_formulation
         assert "rows c1, c7, c14, c39 and c43 scatter" in reason
 
 
+def test_a_loss_that_knows_its_equations_keeps_outliers_and_says_so() -> None:
+    """Without six equations an index array failed, and slices took the next session's: a weight of one half."""
+    problem = values(lambda y: y + 5e-3 * np.isin(np.arange(len(y)), [3, 7])[:, None])(ro.load("position").problem)
+    first, second = np.array_split(np.arange(3 * len(problem.data)), 2)
+
+    def worse_half(r: cp.Variable) -> cp.Expression:
+        return cp.sum_squares(r) + cp.maximum(cp.sum_squares(r[first]), cp.sum_squares(r[second]))
+
+    result = ro.calibrate(problem, ro.Formulation("worse half", worse_half, cp.sum_squares))
+    assert result.excluded is None
+    assert result.verdict.reasons == (
+        "Likely: outliers bias a loss that depends on the order of its equations: leave out c3, c7.",
+    )
+    assert "Outliers, kept because the loss depends on the order of its equations: c3 (" in str(result)
+    without = ro.calibrate(problem.without(["c3", "c7"]), ro.Formulation("sum", lambda r: cp.sum(r**2), cp.sum_squares))
+    assert without.verdict.delivered
+
+
+def test_a_loss_without_gradients_has_no_intervals_and_can_be_stored(tmp_path: Path) -> None:
+    def worst(r: cp.Variable) -> cp.Expression:
+        return cp.sum_squares(r) + 50 * cp.norm_inf(r)
+
+    result = ro.calibrate(ro.load("position").problem, ro.Formulation("worst", worst, cp.sum_squares), 1.0)
+    assert "no quadratic model" in result.no_intervals
+    save_result(result, tmp_path / "result.json")
+    assert load_result(tmp_path / "result.json").x == pytest.approx(result.x)
+
+
 def test_without_a_covariance_it_says_why_wherever_intervals_would_be() -> None:
     instance = ro.load("position")
     result = ro.calibrate(instance.problem, "lasso")

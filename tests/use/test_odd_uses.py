@@ -246,7 +246,9 @@ def test_rows_of_an_instrument_that_moved_are_named() -> None:
     assert not ro.use.validate(result, instance.validation).mistake
     rejected = ro.calibration.accept(result, ro.data.Requirement(limit=2e-4), moved)
     assert rejected.verdict == "rejected"
-    assert "If the instrument or the base moved, use --register" in str(rejected)  # a good robot is not rejected without a hint
+    assert "If the instrument or the base moved, use --register" in str(
+        rejected
+    )  # a good robot is not rejected without a hint
     # by less than a row's interval: too few coordinates are inside theirs
     moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([6e-5, -6e-5, 6e-5])),))
     found, accepted = ro.use.validate(result, moved), ro.calibration.accept(result, requirement, moved)
