@@ -329,7 +329,7 @@ def calibrate(
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
     Exit code 1 if the robot is not delivered or the acceptance test rejects it; 4 if that is inconclusive: the test,
-    or without a limit the median U, which is above the error of the nominal robot.
+    or without a limit the median U of measured positions, which is above the error of the nominal robot.
     """
     with console.progress() as say:
         from rpim_opt.report.summary import describe, summary
