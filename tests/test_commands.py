@@ -444,11 +444,10 @@ def test_new_measurements_in_another_unit_are_named(monkeypatch, capsys, cell, m
     for units, said in (("deg,m", "name the columns q1_rad"), ("rad,mm", "name the columns x_m, y_m, z_m")):
         arguments = [str(made / "results"), str(cell / "later.csv"), "--units", units]
         assert run(monkeypatch, "validate", *arguments) == 1
-        *_, last = capsys.readouterr().out.strip().splitlines()
-        assert last.startswith("Likely: ")
-        assert said in last
+        likely = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("Likely: "))
+        assert said in likely
         assert run(monkeypatch, "validate", *arguments, "--json") == 1
-        assert json.loads(capsys.readouterr().out)["mistake"] == last
+        assert json.loads(capsys.readouterr().out)["mistake"] == likely
         result, rows, *unit = arguments
         for refusing in (
             ["update", *arguments, "--out", str(tmp_path / "next")],
