@@ -533,7 +533,7 @@ def _unmodelled(result: Calibration, region: Region) -> list[str]:
     for joint in result.outside(corners).joints:
         unit, si = display(result.problem.robot.joint_dimensions[joint - 1])
         low, high = region.limits[joint - 1] / si
-        named.append(f"joint {joint} from {low:.4g} to {high:.4g} {unit}")
+        named.append(f"joint {result.problem.robot.joint(joint - 1)} from {low:.4g} to {high:.4g} {unit}")
     if named:
         where = f"{joined(named)}, which is part of the region: no measurement checked the model there."
         lines.append(f"Missing: measurements with {where}")

@@ -225,9 +225,10 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
         unit, si = display(dimension)
         low, high = robot.limits[i]
         if q[:, i].min() < low - 1e-9 or q[:, i].max() > high + 1e-9:
-            yield f"joint {i + 1} exceeds its limits {low / si:.1f} to {high / si:.1f} {unit}."
+            yield f"joint {robot.joint(i)} exceeds its limits {low / si:.1f} to {high / si:.1f} {unit}."
         if np.ptp(q[:, i]) < LEAST_TRAVEL[robot.joint_types[robot.leading[i]]]:
-            yield f"joint {i + 1} moves only {np.ptp(q[:, i]) / si:.2f} {unit}: its parameters are poorly identifiable."
+            moves = f"joint {robot.joint(i)} moves only {np.ptp(q[:, i]) / si:.2f} {unit}"
+            yield f"{moves}: its parameters are poorly identifiable."
     for block in problem.data.blocks:
         if block.y.shape[1] < 3:
             continue

@@ -24,7 +24,7 @@ from rpim_opt.problem.problem import SHIFTED, CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.registration.points import FAR, Fit, Points, agreeing, fit_points, lengths_of, misfit, points_of
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
-from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.mdh import Robot, numbered
 from rpim_opt.robot.parameters import tool_prefix
 
 LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}  # a joint that moves less [rad, m] is hardly seen
@@ -471,7 +471,7 @@ def _odd_values(problem: CalibrationProblem, points: Points) -> Iterator[str]:
     points = replace(points, turns=None)
     whole = misfit(points)
     turning = [i for i, kind in enumerate(points.robot.joint_types) if kind == "revolute"]
-    fitted = {f"joint {i + 1}": replace(points, q=_values_that_fit(points, i)) for i in turning}
+    fitted = {f"joint {points.robot.joint(i)}": replace(points, q=_values_that_fit(points, i)) for i in turning}
     for k, axis in enumerate("xyz"):
         other = points
         for _ in range(MOST_ROUNDS):
@@ -656,8 +656,8 @@ def _turned_joint(problem: CalibrationProblem, out: Points, fit: Fit, limit: flo
             best = explained.sum()
             named = _rows(problem.data, out.row[explained], "has", "have")
             off = np.abs(np.degrees(np.angle(np.exp(1j * (q - out.q)[explained, i]))))
-            by = f"{off.min():.1f} to {off.max():.1f} deg"
-            said = f"{named} wrong values of joint {i + 1}, by {by}, which explain the errors: correct its column"
+            of = f"joint {out.robot.joint(i)}, by {off.min():.1f} to {off.max():.1f} deg"
+            said = f"{named} wrong values of {of}, which explain the errors: correct its column"
     if said:
         yield f"{said}, or leave them out ([exclude])."
 
@@ -824,7 +824,8 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
     for i, name in enumerate(_zeros(problem.robot)):
         cause = "did the joint slip or fall back under its load, or was it remastered"
         by = shares | (_shares(problem, i) if along_joints else {})
-        yield from _changes(whole, there, A, [name], f"zero of joint {i + 1}", cause, by)
+        zero = f"zero of joint {numbered(i, problem.robot.joint_names)}"
+        yield from _changes(whole, there, A, [name], zero, cause, by)
     model = replace(problem.robot, joint_map=np.eye(len(problem.robot.mdh)), limits=np.empty((0, 0)))
     flange = forward_kinematics(model, problem.joint_values)
     down = {
@@ -1079,11 +1080,12 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
         factor = coefficients[0]
         to_model = robot.joint_map.copy()
         to_model[i] += factor * robot.joint_map[j]
-        what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
+        one, other = (numbered(k, robot.joint_names) for k in (i, j))
+        what = f"joint {one} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
         if i != j:
             sign = signs(robot.joint_map)
             part = sign[i] * factor * sign[j]
-            what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {part:+.4f} q{j + 1})"
+            what = f"joint {one} is coupled to joint {other} (q{i + 1} {part:+.4f} q{j + 1})"
         return what, coupling(to_model)
 
     for i, j in product(of_zero, range(q.shape[1])):

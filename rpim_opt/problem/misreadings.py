@@ -128,7 +128,7 @@ def pose_misfit(robot: Robot, data: Dataset, tool: Array | None = None) -> float
 
 def _readings(points: Points) -> list[Misreading]:
     """Return all single mistakes that are looked for."""
-    readings = [*_of_joints(points.robot), *_of_rows(len(points.row), points.robot.dof)]
+    readings = [*_of_joints(points.robot), *_of_rows(len(points.row), points.robot)]
     if points.seen:
         remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or vice versa'
         return [*readings, Misreading("the camera and the board exchanged", remedy, _inverted)]
@@ -150,7 +150,7 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
         yield _joints(f"joint values read {unit}", remedy, np.diag(np.where(turning, factor, 1)))
     for (factor, (unit, _)), (i, j) in product(list(ANGLES.items())[:2], combinations(range(robot.dof + 1), 2)):
         if turning[i:j].all() and j - i < robot.dof:  # one joint, or several next to each other
-            turned = f"joint{'s' * (j - i > 1)} {joined([str(k + 1) for k in range(i, j)])}"
+            turned = f"joint{'s' * (j - i > 1)} {joined([robot.joint(k) for k in range(i, j)])}"
             remedy = f"multiply the values of {turned} by {factor:.6g} or name the unit"
             yield _joints(f"{turned} read {unit}", remedy, eye + (factor - 1) * np.diag(eye[i:j].sum(axis=0)))
     if not turning.all():
@@ -160,27 +160,28 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
     for i in range(robot.dof):
         flipped = eye - 2 * np.outer(eye[i], eye[i])
         sign = -int(signs(robot.joint_map)[i])
-        yield _joints(f"joint {i + 1} reversed", f"write sign = {sign} for joint {i + 1} in robot.toml", flipped)
-        what = f"joint {i + 1} standing still in all rows"
+        joint = f"joint {robot.joint(i)}"
+        yield _joints(f"{joint} reversed", f"write sign = {sign} for {joint} in robot.toml", flipped)
+        what = f"{joint} standing still in all rows"
         yield _joints(what, "check its brake and its column", eye - np.outer(eye[i], eye[i]))
-    for i in range(1, robot.dof - 1):
-        remedy = f"put it on the last link, or describe the robot up to joint {i}"
+    for i, last in enumerate(map(robot.joint, range(robot.dof - 2)), start=1):
+        remedy = f"put it on the last link, or describe the robot up to joint {last}"
         before = np.diag(np.arange(robot.dof) < i).astype(float)
-        yield _joints(f"the reflector on the link of joint {i} (later joints do not move it)", remedy, before)
+        yield _joints(f"the reflector on the link of joint {last} (later joints do not move it)", remedy, before)
     for i, j in combinations(range(robot.dof), 2):
         exchanged = eye.copy()
         exchanged[[i, j]] = eye[[j, i]]
         if turning[i] != turning[j]:  # degrees were read as millimetres, and these as degrees
             exchanged *= np.where(turning, DEGREES_PER_MM, 1 / DEGREES_PER_MM)[:, None] ** (eye[i] + eye[j])[:, None]
-        remedy = f"exchange the columns of joints {i + 1} and {j + 1}"
-        yield _joints(f"joints {i + 1} and {j + 1} exchanged", remedy, exchanged)
+        both = f"joints {robot.joint(i)} and {robot.joint(j)}"
+        yield _joints(f"{both} exchanged", f"exchange the columns of {both}", exchanged)
     for i, j in permutations(np.flatnonzero(turning), 2):
         for factor in COUPLINGS[bool(abs(i - j) == 1)]:
             M = eye.copy()
             M[i, j] = factor
             size = "" if abs(factor) == 1 else f"{abs(factor):g} "
             sum_of = f"q{i + 1} {'plus' if factor > 0 else 'minus'} {size}q{j + 1}"
-            what = f"joint {i + 1} coupled to joint {j + 1} ({sum_of})"
+            what = f"joint {robot.joint(i)} coupled to joint {robot.joint(j)} ({sum_of})"
             yield _joints(what, coupling(robot.joint_map @ M), M)
 
 
@@ -330,16 +331,16 @@ def _inverted(points: Points) -> Points:
     return replace(points, y=-np.einsum("nij,nj->ni", back, points.y), turns=back)
 
 
-def _of_rows(count: int, dof: int) -> Iterator[Misreading]:
+def _of_rows(count: int, robot: Robot) -> Iterator[Misreading]:
     """Yield readings with joint values of other rows: shifted, one column or all, reversed, in the order of texts."""
     for k, (by, low, back) in product(range(1, min(3, count - 6) + 1), SLIPPED):
         rows = f"{k} row{'s' * (k > 1)}"
         what = f"measured values {rows} too {low} in the table"
         remedy = f"move the measured values {rows} {back}, against the joint values"
         yield Misreading(what, remedy, partial(_slipped, slice(None), -k * by))
-    for i, (by, low, back) in product(range(dof), SLIPPED):
-        what = f"the values of joint {i + 1} one row too {low} in the table"
-        yield Misreading(what, f"move the column of joint {i + 1} one row {back}", partial(_slipped, i, by))
+    for i, (by, low, back) in product(range(robot.dof), SLIPPED):
+        what = f"the values of joint {robot.joint(i)} one row too {low} in the table"
+        yield Misreading(what, f"move the column of joint {robot.joint(i)} one row {back}", partial(_slipped, i, by))
     by_text = np.array(sorted(range(count), key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
     for what, how, order in (
@@ -358,7 +359,7 @@ def _factors(points: Points) -> Iterator[Misreading]:
     """Yield readings with a column, all angles or all lengths times a factor that fits: other units, counts, gears."""
     robot = points.robot
     eye = np.eye(robot.dof)
-    scaled = {f"values of joint {i + 1}": ("q", eye[i]) for i in range(robot.dof)}
+    scaled = {f"values of joint {robot.joint(i)}": ("q", eye[i]) for i in range(robot.dof)}
     turning = np.array(robot.joint_dimensions) == "angle"
     scaled |= {"all joint values": ("q", turning), LENGTHS_OF_ALL: ("y", np.ones(points.y.shape[1]))}
     if not points.lengths:

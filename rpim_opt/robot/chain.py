@@ -131,43 +131,40 @@ def corrected(
     return origins, before[-1] @ T_tool, max(float(np.abs(table[:, 1::2]).sum()) + ends, 1.0)
 
 
-def require_same_arm(
-    robot: Robot, table: Array, joint_types: tuple[str, ...], file: Path, joint_map: Array | None = None
-) -> list[str]:
-    """Refuse a robot whose joints or nominal parameters differ from a file's MDH table (n, 5).
+def require_same_arm(robot: Robot, original: Robot, file: Path) -> list[str]:
+    """Refuse a robot whose joints or nominal parameters differ from those of a file.
 
-    The file's joints are those of the table: its joint map, from the controller's values, is not in the file.
-    Return that (`joint_values`).
+    The values of its joints may be others than the controller's: return a sentence on that (`joint_values`).
     """
-    if robot.joint_types != joint_types:
-        found, accepted = ", ".join(robot.joint_types), f"those of the file, {', '.join(joint_types)}"
+    if robot.joint_types != original.joint_types:
+        found, accepted = ", ".join(robot.joint_types), f"those of the file, {', '.join(original.joint_types)}"
         raise InputError("joints of the robot", found, accepted, file)
-    notes = joint_values(robot, np.eye(len(joint_types)) if joint_map is None else joint_map, file)
-    deviation = np.abs(robot.mdh - table)
-    deviation[:, ::2] = np.abs(np.angle(np.exp(1j * deviation[:, ::2])))
-    joint, column = np.unravel_index(np.argmax(deviation), deviation.shape)
-    if deviation[joint, column] > ANOTHER_ARM:
+    notes = joint_values(robot, original, file)
+    deviation = robot.mdh - original.mdh
+    deviation[:, ::2] = np.angle(np.exp(1j * deviation[:, ::2]))
+    joint, column = np.unravel_index(np.argmax(np.abs(deviation)), deviation.shape)
+    if abs(deviation[joint, column]) > ANOTHER_ARM:
         unit = "rad" if column % 2 == 0 else "m"
-        found = f"{MDH[column]}{joint + 1} differs from the file by {deviation[joint, column]:.3g} {unit}"
+        found = f"{MDH[column]}{joint + 1} differs from the file by {abs(deviation[joint, column]):.3g} {unit}"
         accepted = "a robot identified from this file's nominal parameters, between the same links"
         raise InputError(f"robot ({robot.source or robot.name})", found, accepted, file)
     return notes
 
 
-def joint_values(robot: Robot, joint_map: Array, file: Path) -> list[str]:
+def joint_values(robot: Robot, original: Robot, file: Path) -> list[str]:
     """Return a sentence on the values of a file's joints where they are not those of the robot's controller.
 
-    With the file's own ``joint_map`` F (n, k) and the robot's M they are S q, F S = M; refused where no S is.
+    With the file's own joint map F (n, k) and the robot's M they are S q, F S = M; refused where no S is.
     """
-    S = np.round(np.linalg.pinv(joint_map) @ robot.joint_map, 12)
-    wrong = np.flatnonzero(np.abs(joint_map @ S - robot.joint_map).max(axis=1) > 1e-9)
+    S = np.round(np.linalg.pinv(original.joint_map) @ robot.joint_map, 12)
+    wrong = np.flatnonzero(np.abs(original.joint_map @ S - robot.joint_map).max(axis=1) > 1e-9)
     if len(wrong):
         found = f"a sign or coupling of joint {joined([str(i + 1) for i in wrong])}, which follows another in the file"
         raise InputError("joints of the robot", found, "joints that follow others as in the file", file)
     places = []
     for i in np.flatnonzero((np.eye(*S.shape) != S).any(axis=1)):
         terms = [f"{S[i, j]:+.9g} q{j + 1}" for j in np.flatnonzero(S[i])]
-        places.append(f"joint {i + 1} is at {' '.join(terms)}")
+        places.append(f"joint {original.joint(i)} is at {' '.join(terms)}")
     if not places:
         return []
     return [f"{file.name}: with the calibration's joint values q its {joined(places)}; the file lacks this mapping."]

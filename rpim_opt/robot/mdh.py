@@ -123,9 +123,9 @@ class Robot(Brief):
     the controller's joint values and the model's, the identity by default (a FANUC counts joint 3 from the horizontal);
     mimic joints have a row and no column: dof is less than n then. ``limits`` (dof, 2) are lower and upper joint values
     of the controller [rad or m], infinite where unknown; ``source`` is the origin of the table. ``model`` are
-    terms of a user's own, by which it moves besides; `forward_kinematics` is of the table alone. InputError for shapes
-    that do not fit, numbers that are not finite, a singular joint map, limits that are not in order, masses that are
-    not one per joint.
+    terms of a user's own, by which it moves besides; `forward_kinematics` is of the table alone. ``joint_names`` are
+    what a file calls the joints. InputError for shapes that do not fit, numbers that are not finite, a singular joint
+    map, limits that are not in order, masses or names that are not one per joint.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -143,6 +143,7 @@ class Robot(Brief):
     source: str = ""
     gravity: Gravity = field(default_factory=Gravity)
     model: Model = field(default_factory=Model)
+    joint_names: tuple[str, ...] = ()
 
     def _short(self) -> str:
         return f"'{shortened(self.name)}', {self.dof} joints"
@@ -170,8 +171,8 @@ class Robot(Brief):
         limits = _frozen(self.limits if np.size(self.limits) else np.tile([-np.inf, np.inf], (k, 1)))
         right = limits.shape == (k, 2) and bool((limits[:, 0] < limits[:, 1]).all())
         require(right, "limits", f"{limits.tolist()}", f"{k} pairs lower < upper")
-        masses = len(self.gravity.masses)
-        require(masses in (0, n), "gravity", f"{masses} masses", f"{n}, one per joint")
+        for where, each in (("masses", self.gravity.masses), ("joint_names", self.joint_names)):
+            require(len(each) in (0, n), where, f"{len(each)} {where}", f"{n}, one per joint")
         for name, value in (("mdh", mdh), ("joint_types", types), ("joint_map", joint_map), ("limits", limits)):
             object.__setattr__(self, name, value)
 
@@ -179,6 +180,10 @@ class Robot(Brief):
     def dof(self) -> int:
         """Number of the controller's joints."""
         return self.joint_map.shape[1]
+
+    def joint(self, i: int | np.intp) -> str:
+        """Return the number of the controller's joint i (from 0), with its name where that is known."""
+        return numbered(i, [self.joint_names[k] for k in self.leading] if self.joint_names else ())
 
     @property
     def leading(self) -> tuple[int, ...]:
@@ -194,6 +199,11 @@ class Robot(Brief):
     def joint_dimensions(self) -> tuple[str, ...]:
         """``"angle"`` for a revolute joint of the controller, ``"length"`` for a prismatic one."""
         return tuple("angle" if self.joint_types[i] == "revolute" else "length" for i in self.leading)
+
+
+def numbered(i: int | np.intp, names: Sequence[str]) -> str:
+    """Return the number of joint i (from 0), with its name where that is known: ``5 (wrist_2_joint)``."""
+    return f"{i + 1} ({names[int(i)]})" if names and names[int(i)] else f"{i + 1}"
 
 
 def _frozen(values: ArrayLike) -> Array:

@@ -177,7 +177,7 @@ class Compensation:
         low, high = self.robot.limits.T
         for i in np.flatnonzero((self.q[row] <= low) | (self.q[row] >= high)):
             unit, si = display(self.robot.joint_dimensions[i])
-            error += f", joint {i + 1} at its limit of {self.q[row, i] / si:.6g} {unit}"
+            error += f", joint {self.robot.joint(i)} at its limit of {self.q[row, i] / si:.6g} {unit}"
         return error
 
     def _largest_corrections(self) -> dict[str, float]:

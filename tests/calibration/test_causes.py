@@ -1046,6 +1046,13 @@ def test_increments_and_angles_are_named(wrong, named: str) -> None:
     assert named in better_reading(wrong(simulated_arm("ur5e"))).sentence
 
 
+def test_joints_are_named_as_in_their_file() -> None:
+    """With a rail before the arm joint 5 was taken for the file's `joint_a5`, which is number 6."""
+    problem = joints(lambda q: q[..., [2, 1, 0, 3, 4, 5]])(simulated_arm("ur5e"))
+    problem = replace(problem, robots=replace(problem.robot, joint_names=tuple("ABCDEF")))
+    assert "exchange the columns of joints 1 (A) and 3 (C)" in better_reading(problem).sentence
+
+
 def test_a_coordinate_that_was_computed_is_named() -> None:
     """x and y measured, z of the nominal robot in the same frame: the fit is fair, and the robot wrong by 2 mm."""
     problem = simulated_arm("ur5e")

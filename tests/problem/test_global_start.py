@@ -194,10 +194,12 @@ def test_what_is_found_goes_into_the_mapping() -> None:
 
 def test_a_result_keeps_its_mapping(tmp_path) -> None:
     problem, unseen, _ = simulated("scara", 4)
-    result = ro.calibrate(problem)
+    names = ("Arm_A", "Arm_B", "Quill", "Wrist")
+    result = ro.calibrate(replace(problem, robots=replace(problem.robot, joint_names=names)))
     ro.store.save_result(result, tmp_path / "result.json")
     again = ro.load_result(tmp_path / "result.json")
     assert again.mapping.sentence == result.mapping.sentence
+    assert "joint 2 (Arm_B) reversed (sign = -1), zero of joint 2 (Arm_B) -18.9 deg. " in result.verdict.caution
     assert np.allclose(again.errors(unseen), result.errors(unseen))
     assert again.without_flagged().mapping is not None
 

@@ -289,8 +289,8 @@ def test_a_hostile_urdf_is_refused_in_one_sentence(tmp_path: Path, name: str) ->
         ro.read_urdf(path)
     assert str(refused.value).startswith(str(path))
     assert len(str(refused.value)) < 500
-    with pytest.raises(ro.InputError, match="joints of the robot" if name == "limits" else expected):
-        ro.robot.write_urdf(path, ARM, tmp_path / "new.urdf")  # which has no use for limits
+    with pytest.raises(ro.InputError, match=expected):
+        ro.robot.write_urdf(path, ARM, tmp_path / "new.urdf")
     assert [p.name for p in tmp_path.iterdir()] == ["arm.urdf"]
 
 
@@ -424,7 +424,7 @@ def test_files_keep_their_own_joint_values(tmp_path: Path) -> None:
     y = problem.modelled(1e-3 * np.arange(len(parameters.free)))[0]
     result = ro.calibrate(problem.on(ro.Dataset.of(q, y, 1e-5)), ro.tikhonov, weight=1e-3)
     notes = ro.use.export_files(result, target, urdf=path, tip="tip", despite_verdict=True).notes
-    assert "joint 1 is at -1 q1 and joint 2 is at +1 q1 +1 q2" in notes[-1]
+    assert "joint 1 (J1) is at -1 q1 and joint 2 (J2) is at +1 q1 +1 q2" in notes[-1]
     found = urdf_kinematics(target, "tip", q @ joint_map.T)[:, :3, 3]
     assert np.abs(found - result.problem.modelled(result.x)[0]).max() < EXACT
 
@@ -699,6 +699,9 @@ def equal(a: ro.robot.Robot, b: ro.robot.Robot) -> bool:
     return arrays and a.joint_types == b.joint_types
 
 
+NAMES = ("rail", "l7_joint_A1", "", 'a "quoted" one', "\u00e4")
+
+
 def any_robot(seed: int, coupled: bool) -> ro.robot.Robot:
     rng = np.random.default_rng(seed)
     mdh = rng.normal(size=(5, 5)) * 10.0 ** rng.integers(-12, 3, (5, 5))
@@ -708,7 +711,7 @@ def any_robot(seed: int, coupled: bool) -> ro.robot.Robot:
     limits[2] = -np.inf, np.inf
     joint_map = rng.normal(size=(5, 5)) if coupled else np.diag(rng.choice([-1.0, 1.0], 5))
     kinds = tuple(rng.choice(["revolute", "prismatic"], 5).tolist())
-    return ro.robot.Robot('Größe "5" \\ tab\t', mdh, kinds, joint_map, limits, "drawing\nsheet 2")
+    return ro.robot.Robot('Größe "5" \\ tab\t', mdh, kinds, joint_map, limits, "drawing\nsheet 2", joint_names=NAMES)
 
 
 @pytest.mark.parametrize("ending", ["toml", "json", "csv"])
@@ -724,7 +727,7 @@ def test_tables_come_back_to_the_last_bit(tmp_path: Path, ending: str, coupled: 
     again = ro.read_robot(path)
     assert equal(again, robot)
     if ending != "csv":
-        assert (again.name, again.source) == (robot.name, robot.source)
+        assert (again.name, again.source, again.joint_names) == (robot.name, robot.source, NAMES)
     if ending == "toml":
         assert equal(ro.read_robot(path), robot)
 
@@ -890,7 +893,7 @@ def test_a_robot_on_a_table_with_a_reversed_joint_goes_into_universal_robots_fil
     options = {"ur_calibration" if file.endswith("conf") else "ur_kinematics": path}
     notes = ro.use.export_files(result, target, **options, despite_verdict=True).notes
     assert any("770.000 mm along axis 1" in note for note in notes)
-    assert any("joint 4 is at -1 q4" in note for note in notes)
+    assert any("joint 4 (wrist_1) is at -1 q4" in note for note in notes)
     q = configurations(6)
     if file.endswith("conf"):
         written = reach(ro.robot.read_ur_calibration(target, UR10), q @ signs)

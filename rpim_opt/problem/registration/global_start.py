@@ -37,7 +37,7 @@ from rpim_opt.problem.registration.points import (
     stacked,
 )
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame
-from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.mdh import Robot, numbered
 from rpim_opt.robot.parameters import tool_prefix
 
 ACCEPTED = 0.02  # a mapping may leave this part of the extent: an arm's geometric errors are not fitted with it
@@ -96,11 +96,12 @@ class JointMapping:
     same: tuple[Alternative, ...] = ()  # other descriptions of the same robot that change as few joints
     moved: float = 0.0  # how far a reflector is from its stated place in the flange frame [m]
     lengths: tuple[str, ...] = ()  # one of which, with the other sign and joints as stated, is the same robot
+    joint_names: tuple[str, ...] = ()
 
     @property
     def explanations(self) -> str:
         """Return the descriptions of the robot as text: lengths of the other sign, one number each, then mappings."""
-        counted = [described(self.joint_types, each.sign, each.zero) for each in (self, *self.same)]
+        counted = [described(self, each.sign, each.zero) for each in (self, *self.same)]
         return ", or ".join([*(f"{name} of the other sign in the robot file" for name in self.lengths), *counted])
 
     @property
@@ -120,7 +121,7 @@ class JointMapping:
     def sentence(self) -> str:
         """Return a sentence on the mapping, its errors and its certainty."""
         return (
-            f"Joint mapping estimated from the data: {described(self.joint_types, self.sign, self.zero)} "
+            f"Joint mapping estimated from the data: {described(self, self.sign, self.zero)} "
             f"({three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.nominal)} mm; "
             f"{self.starts} random starts: an optimum found by one start in {round(1 / RARE_BASIN)} is missed "
             f"with a probability of {(1 - RARE_BASIN) ** self.starts:.1g})."
@@ -139,17 +140,17 @@ class JointMapping:
                 "frame (such as up) or measured orientations would decide."
             )
         for other in alternatives[:TOLD]:
-            what = described(self.joint_types, other.sign, other.zero).capitalize()
+            what = described(self, other.sign, other.zero)
             if other.mirror:
-                first = described(self.joint_types, self.sign, self.zero)
+                first = described(self, self.sign, self.zero)
                 sentences.append(
-                    f"{what} fits as well as {first}: lengths do not distinguish an arm from its mirror image. "
-                    f"Measure a few positions to decide, or {WRITE}, as the set-up confirms."
+                    f"The data fit {what} as well as {first}: lengths do not distinguish an arm from its mirror "
+                    f"image. Measure a few positions to decide, or {WRITE}, as the set-up confirms."
                 )
                 continue
             values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.deciding, strict=True))
             sentences.append(
-                f"{what} fits as well, and differs by {three_digits(1e3 * other.apart)} mm at other "
+                f"The data fit {what} as well, which differs by {three_digits(1e3 * other.apart)} mm at other "
                 f"configurations: measure at pendant values ({values}) to decide."
             )
         more = len(alternatives) - TOLD
@@ -158,13 +159,14 @@ class JointMapping:
         return tuple(sentences)
 
 
-def described(joint_types: tuple[str, ...], sign: Array, zero: Array) -> str:
-    """Return signs and zeros (dof,) as text."""
+def described(robot: Robot | JointMapping, sign: Array, zero: Array) -> str:
+    """Return signs and zeros (dof,) of its joints as text."""
     parts = []
-    reversed_ = [f"{i + 1}" for i in np.flatnonzero(sign < 0)]
+    reversed_ = [numbered(i, robot.joint_names) for i in np.flatnonzero(sign < 0)]
     if reversed_:
         parts.append(f"joint{'s' * (len(reversed_) > 1)} {joined(reversed_)} reversed (sign = -1)")
-    shifts = [f"joint {i + 1} {_value(joint_types[i], zero[i], '+')}" for i in np.flatnonzero(np.abs(zero) > 1e-9)]
+    shifted = np.flatnonzero(np.abs(zero) > 1e-9)
+    shifts = [f"joint {numbered(i, robot.joint_names)} {_value(robot.joint_types[i], zero[i], '+')}" for i in shifted]
     if shifts:
         parts.append(f"zero of {joined(shifts)}")
     return ", ".join(parts) or AS_STATED
@@ -395,12 +397,12 @@ class _Mappings:
     def same(self, robot: Sequence[int]) -> tuple[Alternative, ...]:
         """Return other descriptions of a robot that change as few joints as its plainest."""
         first, *others = sorted(robot, key=self.plain)
-        types = self.points.robot.joint_types
-        also = {described(types, self.sign[first], self.zeros[first]): first}
+        arm = self.points.robot
+        also = {described(arm, self.sign[first], self.zeros[first]): first}
         for k in others:
             if self.plain(k)[0] == self.plain(first)[0]:
-                also.setdefault(described(types, self.sign[k], self.zeros[k]), k)
-        none = np.zeros(len(types))
+                also.setdefault(described(arm, self.sign[k], self.zeros[k]), k)
+        none = np.zeros(arm.dof)
         ways = list(also.values())[1:]
         return tuple(Alternative(self.sign[k], self.zeros[k], 0.0, none, moved=float(self.moved[k])) for k in ways)
 
@@ -474,7 +476,7 @@ def _judged(
     return JointMapping(
         points.robot.joint_types, sign[i], found.zeros[i], nominal, left, starts, tuple(others),
         mirrored=AS_STATED in behind, behind=" or ".join(behind), same=found.same(first), moved=float(found.moved[i]),
-        lengths=_of_other_sign(points, MIRRORED * left),
+        lengths=_of_other_sign(points, MIRRORED * left), joint_names=points.robot.joint_names,
     )  # fmt: skip
 
 
@@ -485,7 +487,7 @@ def _behind_a_mirror(points: Points, largest: float) -> list[str]:
     robot, other = points.robot, mirrored(points)
     sign = _one_reversed(robot.dof)
     as_well = _explain([replace(other, q=each * other.q) for each in sign], largest)
-    return [described(robot.joint_types, sign[k], np.zeros(robot.dof)) for k in np.flatnonzero(as_well)]
+    return [described(robot, sign[k], np.zeros(robot.dof)) for k in np.flatnonzero(as_well)]
 
 
 def _of_other_sign(points: Points, largest: float) -> tuple[str, ...]:

@@ -69,6 +69,7 @@ class PayloadTable(Table):
 
 
 class _JointTable(Table):
+    name: str = ""
     alpha: Angle = 0.0
     a: Length = 0.0
     theta: Angle = 0.0
@@ -140,6 +141,7 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
         joint_types=tuple(joint.type for joint in table.joint),
         joint_map=np.diag([float(joint.sign) for joint in table.joint]) @ np.array(coupling),
         source=table.source,
+        joint_names=tuple(joint.name for joint in table.joint) if any(joint.name for joint in table.joint) else (),
         gravity=gravity_with(gravity, table.mounting, table.payload, path),
     )
     return replace(robot, limits=np.array([limits[i] for i in robot.leading], dtype=float))
@@ -302,7 +304,7 @@ def write_robot(robot: Robot, path: str | Path, convention: str = "modified") ->
     if ending == ".json":
         write_json(path, content)
     elif ending == ".csv":
-        write_text(path, _csv(content, _in_si(robot), convention))
+        write_text(path, _csv(_content(replace(robot, joint_names=())), _in_si(robot), convention))
     else:
         joints = content.pop("joint")
         payload = content.pop("payload", None)
@@ -328,7 +330,7 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
     axes so nearly parallel that rounded numbers lose the robot; refused is a beta after the last joint.
     """
     table = without_beta(robot).mdh
-    notes = joint_values(robot, np.eye(len(table)), Path(path))
+    notes = joint_values(robot, replace(robot, joint_map=np.empty((0, 0)), limits=np.empty((0, 0))), Path(path))
     units = {c: display(MDH_DIMENSION[c]) for c in MDH[:4]}
     far = [f"d{i} = {1e3 * d:.0f} mm" for i, d in enumerate(table[:, 3], start=1) if abs(d) > FAR]
     numbers = table[:, :4] / [si for _, si in units.values()]
@@ -365,7 +367,8 @@ def _content(robot: Robot) -> dict[str, Any]:
     limits = dict(zip(robot.leading, robot.limits, strict=True))
     content["joint"] = []
     for i, kind in enumerate(robot.joint_types):
-        joint: dict[str, Any] = _quantities(MDH, robot.mdh[i], in_si)
+        joint: dict[str, Any] = {"name": robot.joint_names[i]} if robot.joint_names else {}
+        joint |= _quantities(MDH, robot.mdh[i], in_si)
         if kind != "revolute":
             joint["type"] = kind
         if i in limits and np.isfinite(limits[i]).any():

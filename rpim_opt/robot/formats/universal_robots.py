@@ -29,7 +29,6 @@ from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import Robot
 
 JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
-REVOLUTE = ("revolute",) * 6
 DELTAS = {"theta": "delta_theta", "d": "delta_d", "a": "delta_a", "alpha": "delta_alpha"}
 SIX = ("x", "y", "z", "roll", "pitch", "yaw")
 LINE = re.compile(rb"^( *)([A-Za-z_]\w*):[ \t]*([^\s#]*)[ \t]*(?:#.*)?\r?$")
@@ -82,7 +81,7 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> RobotSetup:
     """
     path = Path(path)
     deltas, _ = _deltas(read_bytes(path))
-    require_same_arm(nominal, nominal.mdh, REVOLUTE, path)
+    require_same_arm(nominal, Robot(nominal.name, nominal.mdh), path)
     table = nominal.mdh.copy()
     table[:, 2:4] += np.column_stack([deltas["theta"], deltas["d"]])
     table[1:, :2] += np.column_stack([deltas["alpha"], deltas["a"]])[:-1]
@@ -107,7 +106,7 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     data = read_bytes(path)
     old, places = _deltas(data)
     robot, nominal = _in_base(robot), _in_base(nominal)
-    notes = require_same_arm(robot, nominal.mdh, REVOLUTE, path)
+    notes = require_same_arm(robot, Robot(nominal.name, nominal.mdh, joint_names=JOINTS), path)
     if np.abs(robot.mdh[0, :2] - nominal.mdh[0, :2]).max() > 1e-12:
         raise InputError("robot", "alpha1 or a1 that deviate", "a base that includes the location of axis 1")
     if not (nominal.mdh[2:4, 1] < 0).all():
@@ -167,7 +166,7 @@ def read_ur_kinematics(path: str | Path) -> RobotSetup:
     path = Path(path)
     chain, _ = _yaml_chain(read_bytes(path))
     table, base, tool, _ = describe(chain)
-    robot = Robot("Universal Robots", table, source=path.name)
+    robot = Robot("Universal Robots", table, source=path.name, joint_names=JOINTS)
     return RobotSetup(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
 
 
@@ -184,7 +183,7 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
     path = Path(source)
     data = read_bytes(path)
     chain, places = _yaml_chain(data)
-    notes = require_same_arm(robot, describe(chain)[0], REVOLUTE, path)
+    notes = require_same_arm(robot, read_ur_kinematics(path).robot, path)
     if robot.mdh[-1, 4]:
         raise InputError("robot", "beta6, which follows the last joint", "a robot with beta6 = 0")
     origins, _, size = corrected(chain, robot.mdh)

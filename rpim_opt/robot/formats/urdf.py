@@ -10,7 +10,7 @@ import functools
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -97,6 +97,7 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
         source=f"{Path(path).name}, {way.steps[0].start} to {way.steps[-1].end}",
         gravity=_masses(urdf, way, table, G).mounted("floor", (T_top_base @ T_base)[:3, :3]),
         model=Model(_displacements(way, table, G) if origins else ()),
+        joint_names=(*[""] * origins, *(joint.name for joint in way.joints)),
     )
     for name, i in zip(way.names, robot.leading, strict=True):
         joint = way.joints[i - origins]
@@ -138,12 +139,11 @@ def write_urdf(
     ``source`` is the original; its `read_urdf` with the same ``base`` and ``tip`` has to be the robot whose parameters
     were identified. ``robot`` has these (`use.identified`), ``base_frame`` and ``tool_frame`` (6,) are identified base
     and tool, x, y, z [m], roll, pitch, yaw [rad]; by default the original's. Numbers read back exactly. Returned
-    is a sentence on joint values that the file counts otherwise than the controller. Refused are another robot, and a
-    tool or last beta where no fixed joint follows the last moving one.
+    are sentences on joint values that the file counts otherwise than the controller, and on zeros of joints. Refused
+    are another robot, and a tool or last beta where no fixed joint follows the last moving one.
     """
     urdf = _read(Path(source))
     way = urdf.way(base, tip)
-    table = describe(way.chain)[0]
     edits: dict[tuple[int, int], str] = {}
     mimics = {name: joint.element.find("mimic") for name, joint in urdf.joints.items()}
     led = {name: mimic.get("joint", "") for name, mimic in mimics.items() if mimic is not None}
@@ -153,8 +153,7 @@ def write_urdf(
         if alone and not np.array_equal(old, new):
             old[old != 0] = new[old != 0]  # the multiplier, and zeros
             edits |= joint.edits(urdf.data, "mimic", {"multiplier": repr(float(old.sum()))})
-    kinds = tuple(joint.kind for joint in way.joints)
-    notes = require_same_arm(robot, table + way.offsets, kinds, Path(source), way.joint_map)
+    notes = require_same_arm(robot, replace(read_urdf(source, base, tip).robot, joint_map=way.joint_map), Path(source))
     origins, tail, size = corrected(way.chain, robot.mdh - way.offsets, base_frame, tool_frame)
     before = [*way.chain.origins, way.chain.tail]
     for between, old, new in zip(way.parts, before, [*origins, tail], strict=True):
@@ -168,7 +167,7 @@ def write_urdf(
         elif np.abs(new - old).max() > 10 * ROUNDING * size:
             at_tip = new is tail
             step = way.steps[-1 if at_tip else 0]
-            what = f"a tool or beta{len(table)}" if at_tip else "a base"
+            what = f"a tool or beta{len(way.joints)}" if at_tip else "a base"
             found = f"{what} that moves link '{step.end if at_tip else step.start}'"
             accepted = f"a link held by a fixed joint, since joint '{step.joint.name}' cannot express it"
             raise InputError("robot", found, f"{accepted}, or no such correction")
