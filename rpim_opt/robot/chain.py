@@ -16,7 +16,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame, frame_numbers, numeric_frame, numeric_link
-from rpim_opt.robot.mdh import MDH, Robot
+from rpim_opt.robot.mdh import MDH, Robot, numbered
 from rpim_opt.robot.terms import Joint, Symbol, Term
 
 NEAR_PARALLEL = 0.35
@@ -132,9 +132,9 @@ def corrected(
 
 
 def require_same_arm(robot: Robot, original: Robot, file: Path) -> list[str]:
-    """Refuse a robot whose joints or nominal parameters differ from those of a file.
+    """Refuse a robot whose joints or nominal parameters differ from those of a file, apart from zeros of joints.
 
-    The values of its joints may be others than the controller's: return a sentence on that (`joint_values`).
+    Return sentences on joint values that the file cannot hold (`joint_values`), and on zeros, which origins hold.
     """
     if robot.joint_types != original.joint_types:
         found, accepted = ", ".join(robot.joint_types), f"those of the file, {', '.join(original.joint_types)}"
@@ -142,12 +142,23 @@ def require_same_arm(robot: Robot, original: Robot, file: Path) -> list[str]:
     notes = joint_values(robot, original, file)
     deviation = robot.mdh - original.mdh
     deviation[:, ::2] = np.angle(np.exp(1j * deviation[:, ::2]))
+    zeros = []
+    for i, kind in enumerate(original.joint_types):
+        column, unit, size = (2, "deg", np.pi / 180) if kind == "revolute" else (3, "mm", 1e-3)
+        if abs(deviation[i, column]) > ANOTHER_ARM:
+            zeros.append(f"joint {numbered(i, original.joint_names)} by {deviation[i, column] / size:+.3f} {unit}")
+            deviation[i, column] = 0.0
     joint, column = np.unravel_index(np.argmax(np.abs(deviation)), deviation.shape)
     if abs(deviation[joint, column]) > ANOTHER_ARM:
         unit = "rad" if column % 2 == 0 else "m"
         found = f"{MDH[column]}{joint + 1} differs from the file by {abs(deviation[joint, column]):.3g} {unit}"
-        accepted = "a robot identified from this file's nominal parameters, between the same links"
+        accepted = "a robot identified from this file's nominal parameters (uncorrected), between the same links"
         raise InputError(f"robot ({robot.source or robot.name})", found, accepted, file)
+    if zeros:
+        notes.append(
+            f"{file.name}: zeros moved against the original, in the joints' origins: {joined(zeros)}. Joint values "
+            "need no correction for them; limits and named poses count from the new zeros."
+        )
     return notes
 
 

@@ -429,6 +429,22 @@ def test_files_keep_their_own_joint_values(tmp_path: Path) -> None:
     assert np.abs(found - result.problem.modelled(result.x)[0]).max() < EXACT
 
 
+def test_zeros_of_joints_stand_in_their_origins(tmp_path: Path) -> None:
+    """A zero beyond 0.1 rad was another robot's, found in the data or written into robot.toml as advised."""
+    path, target = tmp_path / "arm.urdf", tmp_path / "better.urdf"
+    path.write_text(random_urdf(11, "askew"))
+    arm = ro.read_urdf(path, tip="tip")
+    zeros, signs = np.radians([15, 179]), np.diag([-1.0, 1.0])
+    table = arm.robot.mdh + 1e-3 + np.outer(zeros, [0, 0, 1, 0, 0])
+    robot = replace(arm.robot, mdh=table, joint_map=signs)
+    notes = ro.robot.write_urdf(path, robot, target, tip="tip")
+    assert "joint 1 (J1) is at -1 q1" in notes[0]
+    assert "joint 1 (J1) by +15.057 deg and joint 2 (J2) by +179.057 deg" in notes[1]
+    q = configurations(2, 5)
+    expected = numeric_frame(arm.base) @ ro.robot.forward_kinematics(robot, q) @ numeric_frame(arm.tool)
+    assert np.abs(urdf_kinematics(target, "tip", q @ signs) - expected).max() < EXACT
+
+
 def test_what_a_calibration_identified_goes_into_a_file(tmp_path: Path) -> None:
     path, target = tmp_path / "arm.urdf", tmp_path / "better.urdf"
     path.write_text(random_urdf(11, "askew"))
@@ -887,6 +903,7 @@ def test_a_robot_on_a_table_with_a_reversed_joint_goes_into_universal_robots_fil
     nominal = UR10 if file.endswith("conf") else ro.robot.read_ur_kinematics(path).robot
     signs, standing = np.diag([1.0, 1, 1, -1, 1, 1]), nominal.mdh.copy()
     standing[0, 2:4] += 0.3, 0.77
+    standing[4, 2] += np.pi / 2  # and the zero of a joint elsewhere
     robot = replace(nominal, mdh=standing, joint_map=signs)
     problem, truth = simulated(("d4", "a[34]", "theta[2-6]", "base_*"), robot=robot, configurations=40, noise=1e-5)
     result = replace(ro.calibrate(problem, "tikhonov", 1.0), x=truth)
@@ -894,6 +911,7 @@ def test_a_robot_on_a_table_with_a_reversed_joint_goes_into_universal_robots_fil
     notes = ro.use.export_files(result, target, **options, despite_verdict=True).notes
     assert any("770.000 mm along axis 1" in note for note in notes)
     assert any("joint 4 (wrist_1) is at -1 q4" in note for note in notes)
+    assert any("zeros moved against the original, in the joints' origins: joint 5 (wrist_2) by +" in n for n in notes)
     q = configurations(6)
     if file.endswith("conf"):
         written = reach(ro.robot.read_ur_calibration(target, UR10), q @ signs)
