@@ -688,17 +688,21 @@ class Addition(NamedTuple):
 
 
 def _explained(
-    model: LinearModel, x: Array, additions: Iterable[Addition], left_at_most: float = MOVED
+    model: LinearModel, x: Array, angle: np.ndarray, additions: Iterable[Addition], left_at_most: float = MOVED
 ) -> tuple[float, Addition, Array] | None:
     """Return which part of a model's residual at x (n,) is left, by which addition, with which coefficients (c,).
 
     Beside the parameters with their prior it must leave at most that part of the sum of squares, less than chance does
-    once in a million (F test, all additions counted): None where none does.
+    once in a million (F test, all additions counted): None where none does. Where lengths and angles scatter unlike
+    their stated noise the sum of squares has as many equations as a chi-squared of its mean and variance (Satterthwaite
+    1946).
     """
     taken = _freedom(model)
     without = _without_parameters(model)
     rest = without((model.b - model.A @ (x / model.parameters.scale))[:, None])[:, 0]
     whole = float(rest @ rest)
+    kinds = [rest[: len(angle)][part] ** 2 for part in (angle, ~angle) if part.any()]
+    uneven = len(angle) * sum(float((each.sum() / max(whole, TINY)) ** 2) / len(each) for each in kinds)
     every = list(additions)
     tried: list[tuple[float, float, Addition, Array]] = []  # by the variance that is left: of many columns against few
     for addition in every:
@@ -712,7 +716,7 @@ def _explained(
     if not tried or not whole:
         return None
     _, gain, addition, step = min(tried, key=lambda each: each[0])
-    spare = max(len(model.A) - taken - len(step), 1)
+    spare = max((len(model.A) - taken - len(step)) / max(uneven, 1.0), 1)
     left = max(whole - gain, 1e-300)
     chance = fdtrc(len(step), spare, gain / len(step) / (left / spare))
     if gain <= (1 - left_at_most) * whole or chance * len(tried) >= RARE or np.abs(step).max() > addition.most:
@@ -763,14 +767,15 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
     acceptable = min(max(of_noise, min(own, default=0.0)), 1.0)
     most = min(MOVED if most is None else most, acceptable**2)
     moves = _moves(problem, x, along_joints=most <= MOVED)
-    best = _explained(model, x, chain(moves, _gears(problem, model), _scales(problem, x, model)), most)
+    angle = Equations.of(problem.data).angle
+    best = _explained(model, x, angle, chain(moves, _gears(problem, model), _scales(problem, x, model)), most)
     if single:
         yield from _said_of_addition(best)
         return
     # zeros of all joints fit two gross errors, whatever these are, but no more
     what, cause = "set of joint zeros", "did several joints slip, or were they remastered"
     changes = _changes(problem, x, model.A, _zeros(problem.robot), what, cause, _shares(problem))
-    several = _explained(model, x, changes, most)
+    several = _explained(model, x, angle, changes, most)
     left = np.inf if best is None else best[0]
     if several is not None and several[0] < SEVERAL * left:
         best, left = several, several[0]

@@ -244,6 +244,16 @@ def test_a_weight_that_makes_a_robot_worse_than_nominal_is_no_delivery() -> None
     assert any("larger than those of the nominal robot" in reason for reason in result.verdict.reasons)
 
 
+@pytest.mark.parametrize("seed", [3, 11])
+def test_positions_noisier_than_stated_are_no_drift(seed: int) -> None:
+    """Of poses only the positions are: they alone are what a sum of squares has for equations."""
+    problem = ro.load("pose").problem
+    rng = np.random.default_rng(seed)
+    few = problem.on(problem.data.take(np.sort(rng.permutation(len(problem.data))[:20])))
+    noisy = values(lambda y: y + np.pad(rng.normal(0.0, 5e-4, (20, 3)), [(0, 0), (0, 4)]))(few)
+    assert ro.calibrate(noisy).verdict.delivered
+
+
 def test_a_noise_in_another_unit_is_not_delivered() -> None:
     problem = ro.load("position").problem
     (block,) = problem.data.blocks
