@@ -279,3 +279,12 @@ def test_arguments_that_cannot_be(monkeypatch, capsys, tmp_path, arguments: list
     arguments = [str(tmp_path / "out") if argument == "OUT" else argument for argument in arguments]
     assert run(monkeypatch, *arguments) == 2
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_reader_that_goes_away_changes_no_exit_code() -> None:
+    """As of ``rpim-opt ... | head``: it was that of a robot that is not delivered."""
+    command = [sys.executable, "-m", "rpim_opt", "robots"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        process.stdout.close()
+        assert process.wait() == 0
+        assert process.stderr.read() == ""

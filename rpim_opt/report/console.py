@@ -23,14 +23,17 @@ if TYPE_CHECKING:
 
 
 def show(text: str | dict[str, Any], stream: TextIO | None = None) -> None:
-    """Print a text without control characters, or a document, flushed so that a closed pipe is noticed."""
+    """Print a text without control characters, or a document; a reader that went away changes no exit code."""
     stream = stream or sys.stdout
     lines = visible(text if isinstance(text, str) else json_text(text).rstrip("\n")).split("\n")
     if stream and stream.isatty():  # break sentences at words; rows of tables, with wider gaps, stay lines
         wrapper = TextWrapper(get_terminal_size().columns, break_long_words=False, break_on_hyphens=False)
         lines = [line if "  " in line else wrapper.fill(line) for line in lines]
     encoding = getattr(stream, "encoding", None) or "utf-8"
-    print("\n".join(lines).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+    try:
+        print("\n".join(lines).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+    except BrokenPipeError:
+        _close(stream)
 
 
 def fail(text: str, code: int) -> None:
@@ -44,12 +47,9 @@ def fail(text: str, code: int) -> None:
 
 @contextmanager
 def output_errors() -> Iterator[None]:
-    """Exit quietly if the output pipe is closed, and with a sentence for other errors of the operating system."""
+    """Exit with a sentence for errors of the operating system."""
     try:
         yield
-    except BrokenPipeError:
-        _close(sys.stdout)
-        sys.exit(1)
     except OSError as error:
         if error.filename is not None:  # a name that is too long, a folder without permission
             fail(f"{error.filename}: {error.strerror}.", 2)
