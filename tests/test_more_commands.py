@@ -146,7 +146,7 @@ def test_an_instrument_that_was_set_up_anew_is_registered_by_every_command_that_
 ) -> None:
     result, new, old = moved
     assert run(monkeypatch, "monitor", result, new) == 1
-    assert "Use --register in `validate`, `monitor` and `accept`" in capsys.readouterr().out
+    assert "use --register in `validate`, `monitor` and `accept`" in capsys.readouterr().out
     for command in (["monitor", new], ["validate", new], ["accept", "--limit", "0.5", "--data", new]):
         assert run(monkeypatch, command[0], result, *command[1:], "--register") == 0, command
         assert "Registered again: the measurements were displaced as a whole by" in capsys.readouterr().out
