@@ -33,7 +33,7 @@ def show(text: str | dict[str, Any], stream: TextIO | None = None) -> None:
     try:
         print("\n".join(lines).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
     except BrokenPipeError:
-        _close(stream)
+        _close(stream or sys.stdout)
 
 
 def fail(text: str, code: int) -> None:
