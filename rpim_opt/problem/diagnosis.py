@@ -768,6 +768,8 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
     most = min(MOVED if most is None else most, acceptable**2)
     moves = _moves(problem, x, along_joints=most <= MOVED)
     angle = Equations.of(problem.data).angle
+    if problem.touches:  # lengths, without those that place the touched points
+        angle = np.zeros(len(model.A), dtype=bool)
     best = _explained(model, x, angle, chain(moves, _gears(problem, model), _scales(problem, x, model)), most)
     if single:
         yield from _said_of_addition(best)

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field, create_model
+from pydantic import ConfigDict, Field, create_model, model_validator
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import inside, read_toml
 from rpim_opt.basics.schema import Angle, Length, Name, Table, validate
-from rpim_opt.basics.units import fits, quantities, split_unit
+from rpim_opt.basics.units import accepted_units, fits, quantities, split_unit
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import FRAMES
 from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
@@ -220,12 +220,20 @@ Figure = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class DistanceTable(Table):
-    """A known distance; one for validation is not used in the fit."""
+    """A known distance; ``mm = 50`` is short for ``distance_mm = 50``. One for validation is not used in the fit."""
 
     between: Pair
     validation: bool = False
     distance: Length
     sigma: Annotated[float | None, "length"] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _distance(cls, table: Any) -> Any:
+        units = accepted_units("length")
+        if not isinstance(table, dict):
+            return table
+        return {f"distance_{key}" if key in units else key: value for key, value in table.items()}
 
 
 class AngleTable(Table):

@@ -42,6 +42,14 @@ def test_real_sockets_at_the_place_held_back(name: str, most: float) -> None:
     assert np.nanmax(result.errors(instance.validation, "stated length")) < 6e-5  # the 50 mm
 
 
+@pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="needs ../shared/data")
+def test_the_folders_of_real_arms_are_read_and_one_of_touches_is_judged() -> None:
+    """Folders may say ``mm = 50`` of a known distance; rows of touches are more than their equations."""
+    folders = [path.parent for path in sorted((SHARED / "data").glob("*/problem.toml"))]
+    assert len(folders) == len([folder for folder in folders if len(ro.load(folder).problem.data)]) >= 10
+    assert ro.load(SHARED / "data" / "panda3_sockets").calibrate().verdict == ro.calibration.Verdict()
+
+
 @pytest.mark.slow
 def test_intervals_hold() -> None:
     """Of differences of noise-free touches elsewhere, and of noisy ones, on arms that nothing was tuned to."""
@@ -58,7 +66,7 @@ def test_intervals_hold() -> None:
     [
         ('[[known_distance]]\nbetween = ["A", "J"]\ndistance_mm = 640\n', "known_distance 1.sigma_mm"),
         ('[[known_distance]]\nbetween = ["A"]\ndistance_mm = 640\nsigma_mm = 0.1\n', "known_distance 1.between"),
-        ('[[known_distance]]\nbetween = ["A", "Q"]\ndistance_mm = 640\nsigma_mm = 0.1\n', "'Q'"),
+        ('[[known_distance]]\nbetween = ["A", "Q"]\nmm = 640\nsigma_mm = 0.1\n', "'Q'"),
         (
             '[[known_angle]]\nbetween = ["A", "J"]\ndeg = 45\nsigma_mrad = 0.1\n',
             "1.deg: found 45, accepted: 0 or 90",
