@@ -432,7 +432,10 @@ class Program(Brief):
     def active_multipliers(self, z: Array, weight: float) -> tuple[Array, ...]:
         """Return the multipliers at z by constraint function, zero where a constraint is not active."""
         found = self._active(z, weight)
-        return () if found is None else self._duals(replace(found[0], dual=np.where(found[1], found[0].dual, 0.0)))
+        if found is None:
+            return self.beginning(z).solve(weight).duals
+        optimum, active = found
+        return self._duals(replace(optimum, dual=np.where(active, optimum.dual, 0.0)))
 
     def _active(self, z: Array, weight: float) -> tuple[Point, np.ndarray] | None:
         """Return the minimum from z on, and which rows of the constraints are active there (m,), cones as a whole.
