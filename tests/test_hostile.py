@@ -216,11 +216,12 @@ def test_a_full_disk_behind_the_output(arguments: list[str]) -> None:
 
 
 def test_nobody_reads_any_more() -> None:
+    """As of ``rpim-opt ... | head``: the code was that of a robot that is not delivered."""
     read, write = os.pipe()
     os.close(read)
     done = command("robots", stdout=write)
     os.close(write)
-    assert (done.returncode, done.stderr) == (1, "")
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_full_disk_behind_the_errors() -> None:
@@ -279,12 +280,3 @@ def test_arguments_that_cannot_be(monkeypatch, capsys, tmp_path, arguments: list
     arguments = [str(tmp_path / "out") if argument == "OUT" else argument for argument in arguments]
     assert run(monkeypatch, *arguments) == 2
     assert "Traceback" not in capsys.readouterr().err
-
-
-def test_a_reader_that_goes_away_changes_no_exit_code() -> None:
-    """As of ``rpim-opt ... | head``: it was that of a robot that is not delivered."""
-    command = [sys.executable, "-m", "rpim_opt", "robots"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        process.stdout.close()
-        assert process.wait() == 0
-        assert process.stderr.read() == ""
