@@ -167,7 +167,7 @@ def test_checks_in_another_unit_are_no_drift() -> None:
     found = ro.use.monitor(result, replace(data, blocks=(replace(block, y=block.y / 1e3),)))
     assert found.drifts
     assert (
-        "with measured lengths a thousand times larger: name the columns x_m, y_m, z_m, or multiply an array by 1000."
+        "with measured lengths a thousand times larger: name the columns x_m, y_m, z_m, or multiply an array by 1000; "
         in found.mistake
     )
     assert found.mistake in str(found)
