@@ -46,7 +46,7 @@ MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), 
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
 UNUSUAL = {"length": 0.004, "angle": 0.05}
 """Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
-ALIKE = 0.999  # cosine of the angle between effects on the data from which on these do not distinguish their causes
+ALIKE = 0.999  # cosine of two parameters' effects on the data from which on these do not distinguish them
 EXCLUDED = 0.25  # share of the rows that may be outliers
 COMPUTED, COMPUTED_RMS = 0.05, 2e-5  # nominal RMS over the stated noise, and itself [m], of computed positions
 ROUNDED = 1.1  # nominal RMS over what rounding of the measured values makes, below which they were computed, too
@@ -158,12 +158,10 @@ def _like_a_frame(result: Outcome) -> str:
     free, name = framed.parameters.free, p.free.names[worst]
     effects = framed.jacobian(x[framed.parameters.identified])
     effects /= np.maximum(np.linalg.norm(effects, axis=0), TINY)
-    of_frames = framed.parameters.of_frames[framed.parameters.identified]
-    effect = effects[:, free.names.index(name)]
-    share = np.linalg.lstsq(effects[:, of_frames], effect, rcond=1e-6)[0]
-    if np.linalg.norm(effects[:, of_frames] @ share) < ALIKE:
+    alike = np.abs(effects.T @ effects[:, free.names.index(name)]) > ALIKE
+    frames = np.array(free.names)[alike & framed.parameters.of_frames[framed.parameters.identified]].tolist()
+    if not frames:
         return ""
-    frames = np.array(free.names)[of_frames][np.abs(share) > 0.1 * np.abs(share).max()].tolist()
     return (
         f"{name} deviates by {in_unit(result.x[worst], p.free.dimensions[worst])}, which the data do not distinguish "
         f"from an error of the stated {joined(frames)}: check it. If it is wrong, this robot is right only together "
