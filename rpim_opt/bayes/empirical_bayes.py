@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -43,9 +43,7 @@ class Estimated:
     x: Array
 
 
-def estimate(
-    problem: Source, estimator: Estimator, model: str, start: Array | None, keep: Callable[[], bool] = lambda: False
-) -> Estimated:
+def estimate(problem: Source, estimator: Estimator, model: str, start: Array | None, keep: bool = False) -> Estimated:
     """Estimate hyperparameters, outliers, and of the model ``"auto"`` extensions, from a start (n,) [SI] or None.
 
     Outliers are left out of the problem, unless the loss has to ``keep`` the rows that it knows.
@@ -57,9 +55,7 @@ def estimate(
         raise InputError("data", found, "correct units, or a fixed weight") from None
 
 
-def _estimate(
-    problem: Source, estimator: Estimator, model: str, start: Array | None, keep: Callable[[], bool]
-) -> Estimated:
+def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | None, keep: bool) -> Estimated:
     every = sampled(problem)
     p = every.parameters
     if start is None:  # frames registered to the data, the robot nominal
@@ -90,7 +86,7 @@ def _estimate(
         errors = dict(zip(laid.labels, largest_errors(laid, fit.x), strict=True))
         for label, ratio in sorted(outliers.items(), key=lambda item: -item[1]):
             left_out.append(ExcludedRow(label, ratio, *errors[label]))
-        if keep():
+        if keep:
             kept = listed([str(row) for row in left_out], 5)
             notes += (f"Outliers, kept because the loss depends on the order of its equations: {kept}.",)
             left_out = []

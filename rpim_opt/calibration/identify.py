@@ -168,8 +168,8 @@ def calibrate(
     learned = None
     excluded = None
     if weight is None:
-        groups = problem.groups if isinstance(problem, CalibrationProblem) else np.zeros(1)
-        estimated = estimate(problem, estimator, model, start, partial(by_place, formulation, groups))
+        keep = isinstance(problem, CalibrationProblem) and by_place(formulation, problem.groups)
+        estimated = estimate(problem, estimator, model, start, keep)
         left_out = [row.label for row in estimated.learned.left_out]
         if left_out and isinstance(problem, CalibrationProblem):  # in memory
             excluded = problem.data.take(np.flatnonzero(np.isin(problem.labels, left_out)))

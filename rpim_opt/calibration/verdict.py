@@ -144,7 +144,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
 def _like_a_frame(result: Outcome) -> str:
     """Return a sentence if errors of a frame look to the data like the largest deviation of the robot.
 
-    A wrong length of a stated tool is a deviation of the last d, a wrong direction one of the last theta.
+    A wrong length of a stated tool is a deviation of the last d, a wrong turn of a stated base one of theta1.
     """
     p = result.problem.parameters
     least = [UNUSUAL.get(dimension, np.inf) for dimension in p.free.dimensions]

@@ -135,9 +135,7 @@ def understand_of(
     for kind in [known] if known else (pose, position, distance, cable):
         tables = _tables(files, arm, kind, options, targets)
         stems = set().union(*(each.stems for each in tables))
-        forms = [form for form, _ in kind.forms]
-        lacking = kind.points == 2 and not any(stem.startswith("to_") for stem in stems)
-        if known or (not lacking and any(set(form) <= stems for form in (kind.columns, *forms))):
+        if known or kind.stands_in(stems):
             understanding = _whole(files, arm, kind, options, tables)
             wanted = ("rotation",) * ("q1" in stems) if targets else tuple(READINGS)
             doubt = next((each.doubt for each in tables if each.doubt in wanted and kind.turning), "")

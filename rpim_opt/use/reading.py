@@ -153,7 +153,7 @@ def read_measurements(
     columns = understanding.columns
     stems = {split_unit(name)[0] for name in columns}
     kind = calibrated
-    if not any(stems >= set(form) for form in (kind.columns, *(form for form, _ in kind.forms))):
+    if not kind.stands_in(stems):
         # a part of what was calibrated: poses may be validated by positions
         kind = next((part for part in kind.parts if stems >= set(part.columns)), kind)
     board = board_of(result.problem.sample().data)
@@ -183,8 +183,10 @@ def _perhaps_radians(result: Calibration, understanding: Understanding, q: Array
     if q is None or len(q) < 3 or not any(turning):
         return []
     now, then = (float(np.degrees(np.abs(each[:, turning]).max())) for each in (q, next(iter(result.ranges.values()))))
+    if not now <= 2 * np.pi < then:
+        return []
     said = f"Joint values are within {now:.3g} deg of zero, those of the calibration within {then:.3g} deg: if they are"
-    return [f"{said} in radians, name the columns q1_rad, ..."] * (now <= 2 * np.pi < then)
+    return [f"{said} in radians, name the columns q1_rad, ..."]
 
 
 def _understood(

@@ -108,6 +108,16 @@ def test_a_stated_tool_that_is_wrong_looks_like_the_last_link() -> None:
     assert not ro.calibrate(problem.with_parameters(replace(stated, identified=p.identified))).verdict.caution
 
 
+def test_a_stated_base_that_is_too_high_looks_like_the_first_link() -> None:
+    problem = ro.load("position").problem
+    p = problem.parameters
+    names = np.array(p.names)
+    high = replace(
+        p, nominal=p.nominal + 0.01 * (names == "base_z"), identified=p.identified & ~np.char.startswith(names, "base_")
+    )
+    assert ro.calibrate(problem.with_parameters(high)).verdict.caution.startswith("d1 deviates by -10.4 mm, which the")
+
+
 def test_computed_positions_are_no_measurements() -> None:
     problem = simulated_arm("ur5e")
     y = problem.modelled(np.zeros(len(problem.parameters.free)))[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -176,8 +176,7 @@ def _readings(
     for stems in ({f"q{i}" for i in range(1, dof + 1)}, COORDINATES):
         read.update(_without_prefix(read, stems, joints, options.prefix))
     _counted(read, robot)
-    torques = {f"tau{i}" for i in range(1, dof + 1)}
-    whole = torques <= {each.stem for each in read.values()}
+    wanted = {*options.units, *robot.model.columns}
     for name, each in read.items():
         if ANOTHER_POINT.fullmatch(each.stem):
             raise InputError("the header", f"column '{name}', another point", "one row per point, with a column marker")
@@ -185,14 +184,9 @@ def _readings(
             accepted = "roll, pitch, yaw; rx_deg, ry_deg, rz_deg; a quaternion; --rotation vector; --rotation "
             accepted += "'intrinsic xyz'; or --measurement position"
             raise InputError("the header", f"column '{name}', either angles or a rotation vector", accepted)
-        wanted = {*options.units, *robot.model.columns}
         if each.stem == "temperature" and not each.unit and "temperature" not in wanted:
             read[name] = Reading("", "", "a temperature without a unit")
-        effort = "effort" in name and each.stem in torques
-        if effort and not each.unit and wanted.isdisjoint({each.stem, "tau", "torque"}):
-            read[name] = Reading("", "", "an effort without a unit: --units Nm if it is a torque")
-        elif effort and not whole:
-            read[name] = Reading("", "", "not all joints have an effort")
+    _leave_out_efforts(read, dof, wanted)
     _leave_out(read, targets)
     _choose_label(read, table, options.key)
     return read, rotation
@@ -334,6 +328,19 @@ def _counted(read: Readings, robot: Robot) -> None:
     if len(triples) == 1 and not stems & {*COORDINATES, "distance", "q0"}:
         for axis, (_, name) in zip("xyz", sorted(triples[0].items()), strict=True):
             read[name] = read[name]._replace(stem=axis, why="the only three numbered columns besides the joints")
+
+
+def _leave_out_efforts(read: Readings, dof: int, stated: Collection[str]) -> None:
+    """Ignore efforts of ROS that may be currents, having no unit and none ``stated``, and those of some joints only."""
+    torques = {f"tau{i}" for i in range(1, dof + 1)}
+    whole = torques <= {each.stem for each in read.values()}
+    for name, each in read.items():
+        if "effort" not in name or each.stem not in torques:
+            continue
+        if not each.unit and {each.stem, "tau", "torque"}.isdisjoint(stated):
+            read[name] = Reading("", "", "an effort without a unit: --units Nm if it is a torque")
+        elif not whole:
+            read[name] = Reading("", "", "not all joints have an effort")
 
 
 def _leave_out(read: Readings, targets: bool) -> None:
