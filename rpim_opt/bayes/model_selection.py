@@ -34,7 +34,7 @@ GAIN = 5.0
 """By how much -2 ln L over its overdispersion (QAIC, Burnham and Anderson 2002) must fall for a model with extensions.
 
 Of 120 simulated arms without them none gained 4. For sessions and for temperature once more each: other questions."""
-LARGE = 3.0  # by how much larger, in its logarithm, the scale of an extension is in another start
+LARGE = 3.0  # logarithm of a new scale over its prior median where an optimum is looked for
 COMPARED = 1e-2  # slopes of -2 ln L by the logarithms of hyperparameters at which models are compared
 ROUNDS = 3  # linearizations at which the hyperparameters of the selected model are estimated
 SPEAK = 10.0  # fall of -2 ln L for an extension to be spoken of: false picks gain 4, none of many gained 10
@@ -161,7 +161,7 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
     def fitted(candidate: tuple[str, ...]) -> Candidate:
         evidence = models.columns.restricted(models.members(candidate))
         conditions = frozenset(candidate).intersection(CONDITIONS)
-        point = evidence.optima(_starts(evidence, known.get(conditions, before)), COMPARED)[0]
+        point = evidence.optima([_start(evidence, known.get(conditions, before))], COMPARED)[0]
         if conditions and conditions == set(candidate):  # what they explain stood among the noise
             known[conditions] = _hyperparameters(evidence, point)
         return Candidate(point.value + GAIN * complexity(candidate), candidate, evidence, point)
@@ -188,15 +188,14 @@ def _hyperparameters(evidence: Evidence, point: Point) -> dict[str, float]:
     return dict(zip(evidence.names, point.logs.tolist(), strict=True))
 
 
-def _starts(evidence: Evidence, known: Mapping[str, float]) -> list[Array]:
-    """Return where the optimum of a model is looked for, from logarithms of another's hyperparameters by name."""
-    logs = np.array([known.get(name, centre) for name, centre in zip(evidence.names, evidence.centre, strict=True)])
-    new = [i for i, name in enumerate(evidence.names) if name not in known]
-    if not new:
-        return [logs]
-    large = logs.copy()  # at small scales the likelihood is flat in an extension whose effect the noise has taken up
-    large[new] += LARGE
-    return [logs, large]
+def _start(evidence: Evidence, known: Mapping[str, float]) -> Array:
+    """Return where the optimum of a model is looked for, from logarithms of another's hyperparameters by name.
+
+    Scales of extensions begin far above their prior medians: at small scales the likelihood is flat in an extension
+    whose effect the noise has taken up.
+    """
+    pairs = zip(evidence.names, evidence.centre, strict=True)
+    return np.array([known[name] if name in known else centre + LARGE for name, centre in pairs])
 
 
 # --- at a result ------------------------------------------------------------------------------------------------
@@ -264,6 +263,6 @@ class Comparison(Models):
     def _fitted(self, extensions: tuple[str, ...], keep: np.ndarray) -> Candidate:
         """Return a model at its hyperparameters, looked for from those of the result's."""
         evidence = self.columns.restricted(keep)
-        start = _starts(evidence, _hyperparameters(self.plain.evidence, self.plain.point))[:1]
-        point = evidence.optima(start)[0]
+        start = _start(evidence, _hyperparameters(self.plain.evidence, self.plain.point))
+        point = evidence.optima([start])[0]
         return Candidate(point.value + SPEAK * len(extensions), extensions, evidence, point)
