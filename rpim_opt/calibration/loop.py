@@ -186,7 +186,7 @@ def _same(one: float, other: float, apart: float = SAME) -> bool:
     return abs(np.log(one / other)) <= apart
 
 
-def weight_choice(weight: float | str | Selector, penalized: bool) -> WeightChoice:
+def weight_choice(weight: float | Selector, penalized: bool) -> WeightChoice:
     """Return the choice for a number or a selector; refuse anything else."""
     if callable(weight):
         return WeightChoice(weight, settled=not penalized, final=not penalized)
@@ -269,7 +269,7 @@ class Loop:
             reweigh = reweigh.after(before)
         return around(self.source.linearize(self.scale * z, reweigh), self.about)
 
-    def run(self, weight: float | str | Selector, start: Array | None) -> State:
+    def run(self, weight: float | Selector, start: Array | None) -> State:
         """Return the state at the end, from deviations ``start`` (n,) [SI]."""
         state = self.initial(weight_choice(weight, self.formulation.penalty is not None), start)
         while not state.outcome and state.evaluations <= self.options.max_iterations:
@@ -469,7 +469,7 @@ class Ended:
 
 
 def minimize(
-    problem: Source, formulation: Formulation, weight: float | str | Selector, start: Array | None, options: Options
+    problem: Source, formulation: Formulation, weight: float | Selector, start: Array | None, options: Options
 ) -> Ended:
     """Run the loop from deviations ``start`` (n,) [SI], and certify the result.
 

@@ -345,7 +345,6 @@ class Program(Brief):
         solver: str | None = None,
         settings: Mapping[str, Any] | None = None,
         verbose: bool = False,
-        accuracy: float = 0.0,
     ) -> Estimate:
         """Return the solution at a weight.
 
@@ -353,8 +352,7 @@ class Program(Brief):
         constraints move them.
 
         ``damping`` is a term that keeps the solution near a point. With a ``solver`` of CVXPY, its ``settings`` or
-        ``verbose``, `problem` is solved by it, whatever the structure. ``accuracy`` is the part of a loss that is a sum
-        over rows by which a first guess may lie above the minimum.
+        ``verbose``, `problem` is solved by it, whatever the structure.
 
         InputError for a weight that is negative or not finite, and a solver that is not installed. NoSolutionFound
         when the solver does not end with "optimal", or its point misses the constraints; its ``conflict`` names what
@@ -365,14 +363,14 @@ class Program(Brief):
         if solver or settings or verbose:
             estimate = self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
         elif weight == 0 and not self.linear_penalty:  # what multiplies zero is no part of the program
-            alone = self._part(self.structure.without_penalty, self.model).solve(damping=damping, accuracy=accuracy)
+            alone = self._part(self.structure.without_penalty, self.model).solve(damping=damping)
             estimate = replace(alone, penalty=self.value(alone.z, 0.0)[1])
         elif damping is None and self.closed_form:
             estimate = self._at(self._closed(weight), weight)
         elif weight == 0 and damping is None and not self.model.svd[1].all():
-            estimate = self._unidentified(accuracy)
+            estimate = self._unidentified()
         else:
-            estimate = self._by_structure(weight, damping, accuracy)
+            estimate = self._by_structure(weight, damping)
         return replace(estimate, seconds=time.perf_counter() - begin)
 
     def _closed(self, weight: float) -> Array:
@@ -474,10 +472,10 @@ class Program(Brief):
             z = self.inside(z, weight)
         return Estimate(z, weight, *self.value(z, weight), multipliers, iterations=iterations)
 
-    def _by_structure(self, weight: float, damping: Damping | None, accuracy: float) -> Estimate:
+    def _by_structure(self, weight: float, damping: Damping | None) -> Estimate:
         """Return the minimum by the structure of the loss; where that fails, CVXPY's."""
         try:
-            optimum = minimum(self._rows, self._warm, weight, damping, accuracy)
+            optimum = minimum(self._rows, self._warm, weight, damping)
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
@@ -491,17 +489,17 @@ class Program(Brief):
             self._values[z.tobytes(), weight] = values
         return self._at(z, weight, partial(self._duals, optimum), optimum.iterations)
 
-    def _unidentified(self, accuracy: float) -> Estimate:
+    def _unidentified(self) -> Estimate:
         """Return the minimum at weight zero where the data do not identify all, by the proximal point method.
 
         z <- argmin loss(A z - b) + |F (z - last z)|^2 subject to constraints(z) from z = 0 on, with F'F ever smaller
         parts of the projection on what is not identified (Rockafellar, SIAM J. Control Optim. 14(5), 1976).
         """
         _, s, V = self.model.svd
-        best = self._by_structure(0.0, Damping(np.zeros(len(s)), V[s == 0]), accuracy)
+        best = self._by_structure(0.0, Damping(np.zeros(len(s)), V[s == 0]))
         for part in PROXIMAL if self.structure.constrained else ():  # else the term is zero there
             try:
-                found = self._by_structure(0.0, Damping(best.z, part * V[s == 0]), accuracy)
+                found = self._by_structure(0.0, Damping(best.z, part * V[s == 0]))
             except NoSolutionFound:
                 break
             if found.loss >= best.loss or self.violation(found.z) > feasibility_tolerance(best.z):

@@ -126,7 +126,7 @@ class Newton:
     """One search for the minimum of loss(A z - b) + damping(z) + weight penalty(z) subject to constraints.
 
     ``small`` is the program of squares, penalty and constraints; ``kink`` the largest jump of the loss's slope, 0 where
-    it is smooth; ``accuracy`` the part of the loss that may be left.
+    it is smooth.
     """
 
     loss: Loss
@@ -136,7 +136,6 @@ class Newton:
     weight: float
     damping: Damping | None
     kink: float
-    accuracy: float = 0.0
     steps: int = 0
     x: Array = field(default_factory=lambda: np.zeros(0))
     point: Point | None = None
@@ -210,7 +209,6 @@ class Newton:
         r = self._residual(z)
         size = max(min(abs(self._total(r)), float(len(r))), TINY)  # outliers do not loosen it
         secants, t_before = 0.0, 0.0
-        tolerance = max(tolerance, self.accuracy)
         for _ in range(most):
             gradient, H = self._model(r, h)
             pivots = np.diag(np.linalg.cholesky(H + PROXIMAL * np.trace(H) * np.eye(len(H))))
@@ -286,7 +284,7 @@ class Newton:
             if self._value(z, self.x) > before + 2 * added + 1e-12 * abs(before):  # below what rounding lets pass
                 self.x = x_before
                 return z_before, h
-            if added <= self.accuracy * size:
+            if added <= 0:
                 return z, h
             exact = self._exact(z, h)
             if exact is not None:

@@ -68,7 +68,7 @@ class WarmStart:
         return self
 
 
-def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None = None, accuracy: float = 0.0) -> Point:
+def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None = None) -> Point:
     """Return the minimum of a convex program; the structure of the loss selects the method.
 
     ============================ ===================================================
@@ -84,8 +84,8 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
     Penalty and constraints select what solves a small program of n + 1 rows: an active set where they are linear or
     quadratic, else Clarabel. Entries are equations, or configurations where the loss gets their norms.
 
-    ``accuracy`` is the part of the loss that a sum over rows may be above its minimum. Unsolved where no minimum is
-    found, also by a small program of proximal Newton: then CVXPY solves all rows (`Program.solve`).
+    Unsolved where no minimum is found, also by a small program of proximal Newton: then CVXPY solves all rows
+    (`Program.solve`).
     """
     with warm.lock:
         loss = warm.structure.loss
@@ -95,16 +95,14 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
             point = _coupled(loss, rows, warm, weight, damping)
         else:
             try:
-                point = _by_newton(loss, rows, warm, weight, damping, accuracy)
+                point = _by_newton(loss, rows, warm, weight, damping)
             except (OutsideDomain, np.linalg.LinAlgError):
                 point = _all_rows(loss, rows, warm, weight, damping)
         warm.z, warm.x = point.x[warm.canonical.at], point.x
         return point
 
 
-def _by_newton(
-    loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None, accuracy: float
-) -> Point:
+def _by_newton(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
     few = loss.variable.size <= FEW_ENTRIES
     # piecewise linear: one program of all rows; piecewise quadratic: the same where Newton's first small programs would
     # need cones, too, or begin with an unknown active set
@@ -121,7 +119,7 @@ def _by_newton(
     if z is None or x is None:
         x = small.solve(rows.squares.damped(damping), weight).x
         z = x[warm.canonical.at]
-    search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.kink, accuracy)
+    search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.kink)
     if warm.kink:
         z, warm.width = search.non_smooth(z, x, warm.width, begun)
     else:
