@@ -25,6 +25,7 @@ from rpim_opt.study import studies
 from rpim_opt.study.methods import METRICS, UNDELIVERED, methods_of, metrics_of, problems_of, replicate, splits_of
 
 USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")  # metrics of a comparison that states none
+COVERED = "covered_percent"  # the metric of which neither less nor more is better, but 95
 MOST_DRAWS = 100_000  # each is a calibration of its own, and is listed before the first begins
 TIE = 0.01  # errors that differ by no more than this part are a tie
 ENOUGH = 5  # problems from which on an interval speaks of problems like them; with fewer, of these
@@ -79,8 +80,9 @@ def compare(
     ``workers`` are processes on this machine, -1 for all processors; or of a cluster, where ``joblib.parallel_config``
     names one. Finished replicates are written to the file ``journal``, with which a call with the same code (of the
     Python files that are loaded) and arguments goes on: more seeds, splits and counts may be added. It refuses other
-    code and arguments, and those that cannot be pickled. ``resume`` is False to start again; None refuses to
-    drop what it has. ``progress`` is whether a bar is shown, or a function of the finished and the total number.
+    code and arguments, and those that cannot be pickled; what functions read besides, as ``sys.argv``, it does not
+    know. ``resume`` is False to start again; None refuses to drop what it has. ``progress`` is whether a bar is shown,
+    or a function of the finished and the total number.
 
     InputError before anything is computed: for unknown names, words and numbers, and a journal of something else.
 
@@ -105,6 +107,8 @@ def compare(
         seeds = range(max(int(seeds), 0))
     numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0)
     figured = metrics_of(metrics)
+    if next(iter(figured)) == COVERED:
+        raise InputError("metrics", f"'{COVERED}' first, of which 95 is best", "first one of which less is better")
 
     def work(case: Mapping[str, Any]) -> studies.Work:  # which takes no more along than it needs
         return partial(replicate, asked[case["problem"]], ways[case["split"]], compared[case["method"]], figured, case)
@@ -204,8 +208,9 @@ class Comparison:
         the first one that has figures. InputError for an unknown metric or method, or where nothing has figures.
         """
         metric = self.metric if metric is None else metric
-        if metric not in self.metrics:
-            raise InputError("metric", f"'{metric}'", choices(metric, self.metrics))
+        ranked = [name for name in self.metrics if name != COVERED]
+        if metric not in ranked:
+            raise InputError("metric", f"'{metric}'", f"one of which less is better: {choices(metric, ranked)}")
         of = figures(self.rows, metric)
         with_figures = [method for method, values in of.items() if values]
         if against is None and not with_figures:

@@ -410,15 +410,13 @@ def provenance() -> dict[str, str]:
 
 
 def script_code() -> dict[str, str]:
-    """Return digests of the Python files that are loaded besides installed ones, and what a script was called with."""
+    """Return digests of the Python files that are loaded besides installed ones."""
     codes = {}
     for module in list(sys.modules.values()):
         file = Path(getattr(module, "__file__", None) or "")
         own = PACKAGE not in file.parents and not any(folder in file.resolve().parents for folder in LIBRARIES)
         if file.suffix == ".py" and own and file.is_file():
             codes[f"file {file.name} ({module.__name__})"] = sha256(file.read_bytes()).hexdigest()
-            if module.__name__ == "__main__":
-                codes["set of arguments of the script"] = repr(sys.argv[1:])
     return codes
 
 

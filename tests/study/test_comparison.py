@@ -173,6 +173,7 @@ def test_seeds_repeat_only_what_they_change() -> None:
         ({"formulations": (), "selectors": "reml"}, "methods: found none"),
         ({"methods": 3}, "methods: found 3"),
         ({"metrics": []}, "metrics: found none"),
+        ({"metrics": "covered_percent"}, "found 'covered_percent' first, of which 95 is best"),
         ({"metrics": {"a": 3}}, "metrics: found 3"),
     ],
 )

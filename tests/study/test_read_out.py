@@ -42,8 +42,17 @@ def test_what_has_no_figures_is_named_and_nothing_is_summed_up() -> None:
     for against, said in (("c", "against: found 'c'"), ("b", "'b', which has no results")):
         with pytest.raises(ro.InputError, match=said):
             some.summary(against=against)
-    with pytest.raises(ro.InputError, match="metric: found 'max_mm', accepted: rms_mm"):
+    with pytest.raises(ro.InputError, match="metric: found 'max_mm', accepted: one of which less is better: rms_mm"):
         some.summary("max_mm")
+
+
+def test_coverage_is_a_column_and_ranks_nothing() -> None:
+    """95 is best: a method whose intervals cover nothing was first."""
+    found = ro.compare("position", selectors=[1.0, 2.0], metrics=["rms_mm", "covered_percent"], progress=False)
+    assert found.rows[0]["covered_percent"] > 80
+    for ranked in (found.summary, found.plot):
+        with pytest.raises(ro.InputError, match="found 'covered_percent', accepted: one of which less is better: rms"):
+            ranked("covered_percent")
 
 
 def test_replicates_that_are_not_delivered_are_counted() -> None:
