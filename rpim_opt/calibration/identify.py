@@ -137,7 +137,7 @@ def calibrate(
     'Huber'
     """
     formulation = formulation_of(formulation)
-    weight = weight_of(weight)
+    applied: float | Selector | None = weight_of(weight)
     options = Options(max_iterations, tolerance, _logged(progress), solver, settings, verbose)
     told_apart = pick(MODELS, model, "model")
     kinds = tuple(kind for kind in pick(NOISE, noise, "noise") if kind in told_apart)
@@ -156,31 +156,31 @@ def calibrate(
     again: Callable[..., Calibration] = partial(
         calibrate,
         formulation=formulation,
-        weight=weight,
+        weight=applied,
         prior=prior,
         model=model,
         noise=noise,
         **(vars(options) | {"progress": None}),
     )
-    if weight is None and formulation.penalty is None:  # statements have standard deviations
-        weight = 1.0 if prior is not None and prior.statements else 0.0
+    if applied is None and formulation.penalty is None:  # statements have standard deviations
+        applied = 1.0 if prior is not None and prior.statements else 0.0
     estimator = Estimator(prior or Prior(), kinds, nearby)
     learned = None
     excluded = None
-    if weight is None:
+    if applied is None:
         keep = isinstance(problem, CalibrationProblem) and by_place(formulation, problem.groups)
         estimated = estimate(problem, estimator, model, start, keep)
         left_out = [row.label for row in estimated.learned.left_out]
         if left_out and isinstance(problem, CalibrationProblem):  # in memory
             excluded = problem.data.take(np.flatnonzero(np.isin(problem.labels, left_out)))
-        problem, weight, start, learned = estimated.problem, 1.0, estimated.x, estimated.learned
+        problem, applied, start, learned = estimated.problem, 1.0, estimated.x, estimated.learned
         formulation = estimated.stated.penalized(formulation)
     else:
         if model == "auto":
             problem = with_extensions(problem, estimate(problem, estimator, model, start))
         if prior is not None:
             formulation = prior.stated(problem.parameters, widened=False).penalized(formulation)
-    ended = minimize(problem, formulation, weight, start, options)
+    ended = minimize(problem, formulation, applied, start, options)
     choice = ended.state.choice
     message = _with_notes(ending(ended, max_iterations), stated, problem, mapping)
     LOGGER.info(message)
