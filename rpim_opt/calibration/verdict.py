@@ -46,7 +46,7 @@ MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), 
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
 UNUSUAL = {"length": 0.004, "angle": 0.05}
 """Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
-ALIKE = 0.999  # cosine of two parameters' effects on the data from which on these do not distinguish them
+ALIKE = 0.045  # part of an effect on the data that others may leave where these do not distinguish them
 EXCLUDED = 0.25  # share of the rows that may be outliers
 COMPUTED, COMPUTED_RMS = 0.05, 2e-5  # nominal RMS over the stated noise, and itself [m], of computed positions
 ROUNDED = 1.1  # nominal RMS over what rounding of the measured values makes, below which they were computed, too
@@ -142,31 +142,54 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
 
 
 def _like_a_frame(result: Outcome) -> str:
-    """Return a sentence if errors of a frame look to the data like the largest deviation of the robot.
+    """Return a sentence if errors of stated frames look to the data like the largest deviation of the robot.
 
-    A wrong length of a stated tool is a deviation of the last d, a wrong turn of a stated base one of theta1.
+    A wrong length of a stated tool is a deviation of the last d, a wrong place beside the last axis one of its theta.
     """
-    p = result.problem.parameters
-    least = [UNUSUAL.get(dimension, np.inf) for dimension in p.free.dimensions]
-    size = np.where(p.of_frames[p.identified], 0.0, np.abs(result.x) / least)
+    free = result.problem.parameters.free
+    least = [UNUSUAL.get(dimension, np.inf) for dimension in free.dimensions]
+    size = np.where(free.of_frames, 0.0, np.abs(result.x) / least)
     worst = int(size.argmax())
-    if not result.problem.keeps_rows or size[worst] < 1:
-        return ""
-    framed = cast(CalibrationProblem, result.problem).identifying(p.identified | p.of_frames)
-    x = np.zeros(len(p))
-    x[p.identified] = result.x
-    free, name = framed.parameters.free, p.free.names[worst]
-    effects = framed.jacobian(x[framed.parameters.identified])
-    effects /= np.maximum(np.linalg.norm(effects, axis=0), TINY)
-    alike = np.abs(effects.T @ effects[:, free.names.index(name)]) > ALIKE
-    frames = np.array(free.names)[alike & framed.parameters.of_frames[framed.parameters.identified]].tolist()
+    frames = _taking_part(result, worst) if result.problem.keeps_rows and size[worst] >= 1 else []
     if not frames:
         return ""
     return (
-        f"{name} deviates by {in_unit(result.x[worst], p.free.dimensions[worst])}, which the data do not distinguish "
-        f"from an error of the stated {joined(frames)}: check it. If it is wrong, this robot is right only together "
-        "with it."
+        f"{free.names[worst]} deviates by {in_unit(result.x[worst], free.dimensions[worst])}, which the data do not "
+        f"distinguish from an error of the stated {joined(frames)}: check it. If it is wrong, this robot is right only "
+        "together with it."
     )
+
+
+def _taking_part(result: Outcome, k: int) -> list[str]:
+    """Return the stated frame parameters whose effect on the data is that of parameter k; none if it is not.
+
+    Stated is what is not identified, and what prior or constraints hold. What free frames explain is left out first.
+    """
+    p = result.problem.parameters
+    every = cast(CalibrationProblem, result.problem).identifying(p.identified | p.of_frames)
+    names = np.array(every.parameters.free.names)
+    of_frames, placed = every.parameters.free.of_frames, every.parameters.free.placed
+    mine = np.isin(names, p.free.names)
+    x = np.zeros(len(names))
+    x[mine] = result.x
+    effects = every.linearize(x).A
+    sizes = np.maximum(np.linalg.norm(effects, axis=0), TINY)
+    effects /= sizes
+    stated = ~mine | np.isin(names, result.actively_constrained)
+    form = result.program.penalty_form
+    if form is not None:  # within its prior, what is stated has less effect than the parameter that took its error up
+        prior = np.vstack([result.penalty_weight**0.5 * form.matrix, 1e-4 * np.eye(len(result.x))])
+        width = np.linalg.norm(np.linalg.pinv(prior), axis=1)
+        stated[mine] |= width * sizes[mine] < min(width[k], np.abs(result.z[k])) * sizes[mine][k]
+    free, held = effects[:, of_frames & ~stated], placed & stated
+    left = np.column_stack([effects[:, mine][:, k], effects[:, held]])
+    left -= free @ np.linalg.pinv(free, rcond=1e-6) @ left
+    own = left[:, 0]
+    parts = left[:, 1:] * np.linalg.lstsq(left[:, 1:], own, rcond=1e-6)[0]
+    if np.linalg.norm(own) < ALIKE or np.linalg.norm(own - parts.sum(axis=1)) > ALIKE * np.linalg.norm(own):
+        return []
+    part = np.linalg.norm(parts, axis=0)
+    return names[held][part > 0.1 * part.max()].tolist()
 
 
 def kept_rows(result: Outcome) -> np.ndarray:

@@ -118,6 +118,27 @@ def test_a_stated_base_that_is_too_high_looks_like_the_first_link() -> None:
     assert ro.calibrate(problem.with_parameters(high)).verdict.caution.startswith("d1 deviates by -10.4 mm, which the")
 
 
+def test_a_stated_tool_beside_the_last_axis_looks_like_its_joint_zero() -> None:
+    """The last joint turns the right tool to the stated x, and y, which is free, follows."""
+    problem = ro.load("position").problem
+    p = problem.parameters
+    narrow = replace(p, nominal=p.nominal - 2e-3 * (np.array(p.names) == "tool_x"))
+    known = ro.bayes.Prior.known("tool_x = 18 +- 0.02 mm")
+    verdict = ro.calibrate(problem.with_parameters(narrow), prior=known).verdict
+    assert verdict.delivered
+    assert verdict.caution.startswith("theta6 deviates by 159 mrad")
+    assert "an error of the stated tool_x: check it." in verdict.caution
+
+
+def test_what_free_frames_explain_is_no_error_of_stated_ones() -> None:
+    problem = ro.load("position").problem
+    names = np.array(problem.parameters.names)
+    result = ro.calibrate(problem.identifying(problem.parameters.identified & (names != "tool_z")))
+    free = result.problem.parameters.free.names
+    higher = result.x + 6e-3 * (np.array(free) == "d1") - 6e-3 * (np.array(free) == "base_z")
+    assert not replace(result, x=higher).verdict.caution
+
+
 def test_computed_positions_are_no_measurements() -> None:
     problem = simulated_arm("ur5e")
     y = problem.modelled(np.zeros(len(problem.parameters.free)))[0]
