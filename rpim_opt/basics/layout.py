@@ -245,8 +245,8 @@ def _without_numbered_header(full: list[int], rows: Sequence[Sequence[str]]) -> 
         names_between = any(not _count(row) for row in rows[full[0] + 1 : full[1]])
         pairs = zip(first, second, strict=False)
         above_numbers = sum(cell[:1].isalpha() and is_numeral(below) for cell, below in pairs)
-        # LabVIEW: counts and steps of the channels, above the names of columns that begin with a number
-        lines = not is_numeral(first[0]) and is_numeral(rows[full[-1]][0])
+        # LabVIEW: counts and steps of the channels, above the names of columns that begin with a number or a blank
+        lines = first[0][:1].isalpha() and not rows[full[-1]][0][:1].isalpha()
         lines = lines and any(not _count(row) and len(row) > 1 for row in rows[full[0] + 1 : full[-1]])
         if not (names_between and not first[0] and second[0]) and not lines and above_numbers < 2:
             break
@@ -470,12 +470,12 @@ def _parts(stem: str, count: int) -> Sequence[str]:
 
 def _one_row_each(table: RawTable) -> RawTable:
     """Return a table whose rows hold a coordinate, ``P1, X, 1.5``, or a joint and one per point; others as is."""
-    axis = next((name for name, cells in table.columns.items() if _names_parts(cells)), "")
+    named = {name: sorted({str(cell).strip().lower() for cell in cells}) for name, cells in table.columns.items()}
+    axis, parts = next((each for each in named.items() if PARTS.fullmatch(" ".join(each[1]))), ("", []))
     if not axis:
         return table
     texts = {name: [str(cell).strip() for cell in cells] for name, cells in table.columns.items()}
     letters = [cell.lower() for cell in texts.pop(axis)]
-    parts = sorted(set(letters))
     texts = {name: _without_letters(cells, letters) for name, cells in texts.items()}
     points = next(filter(None, (_points(cells, letters) for cells in texts.values())), [])
     if not points:
@@ -509,12 +509,6 @@ def _value_column(columns: Mapping[str, Sequence[str]]) -> str:
         found = f"one row per coordinate, value columns: {', '.join(measured) or 'none'}"
         raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
     return measured[0]
-
-
-def _names_parts(cells: Sequence[Any]) -> bool:
-    """Return whether cells name x, y, z or the joints, and nothing else."""
-    names = sorted({str(cell).strip().lower() for cell in cells})
-    return PARTS.fullmatch(" ".join(names)) is not None
 
 
 def _points(names: Sequence[str], letters: Sequence[str]) -> list[dict[str, int]]:

@@ -17,9 +17,10 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from html import unescape
 from importlib import import_module
+from itertools import islice
 from pathlib import Path
 from string import ascii_letters
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 from zipfile import BadZipFile, ZipFile
 
 import numpy as np
@@ -41,7 +42,7 @@ SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": 
 SAMPLE = 2**15  # characters from which the separator is found
 HTML = (".html", ".htm")
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts", ".md", *HTML)
-EXCEL = (".xlsx", ".xlsm")
+EXCEL = (".xlsx", ".xlsm", ".ods")
 NUMBERS_OF_ROW = 3  # numbers in a row from which on a sheet is one of measurements
 NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
 NO_NUMBER = re.compile(
@@ -52,10 +53,11 @@ FORTRAN = re.compile(r"(?<=\d)[dD](?=[+-]\d)")
 """The sign of an exponent of double precision, 0.15D+01."""
 SEXAGESIMAL = re.compile(r"(\d+)°\s*(\d+)['\u2032]\s*(\d+(?:[.,]\d+)?)(?:\"|\u2033|'')")
 """Degrees, minutes and seconds."""
-HTML_CELL = re.compile(r"<t[hd]\b([^>]*)>([^<]*(?:<(?!/?t(?:[hdr]|able|body|foot)\b)[^<]*)*)", re.IGNORECASE)
-"""What an HTML page states of a cell, and what is in it."""
+CELL = re.compile(r"(?i)<(?:t[hd]|table:[a-z-]*cell)\b([^<>]*)>([^<]*(?:<(?!/?t(?:[hdr]|able|body|foot)\b)[^<]*)*)")
+"""What an HTML page or an OpenDocument sheet states of a cell, and what is in it."""
 FOREIGN = re.compile(rb"[\x80-\xff]{4,}")
 """So many letters beyond ASCII follow each other in no Western European word."""
+NO_AXIS = re.compile(r"9E\+?0?9", re.IGNORECASE)  # what RAPID writes for an axis that is not there
 LIST_OPENS = re.compile(r"[a-zA-Z]*[\[({][\s\d.+\-\[({]")
 ENCODINGS = "--encoding with the one that fits: cp932 (Japanese), gb18030 (Chinese), cp1251 (Russian), utf-16, ..."
 ZEROS = bytes(8)  # no text has so many zeros in a row, in whatever encoding
@@ -65,10 +67,7 @@ BLANKS_CLEARLY = 1.5
 """Blanks separate cells where they part so many times more numbers than any sign does: a label may hold some."""
 FORMULA = re.compile(r"'*[=+\-@\t\r\uff1d\uff0b\uff0d\uff20]")
 """What a spreadsheet computes, be it behind apostrophes that keep it from that."""
-BYTE_ORDER_MARKS = (  # that of UTF-32 begins as UTF-16's does
-    (codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"),
-    (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"),
-)  # fmt: skip
+BYTE_ORDER_MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16"))
 Columns = Mapping[str, Sequence[Any]]
 """Column name to its cells: text from a text or Excel file, whatever the table holds elsewhere."""
 
@@ -219,7 +218,7 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
         raise InputError("--sheet", f"'{sheet}' of a text file", "an Excel workbook")
     whole, notes = decoded(path, encoding)
     if path.suffix.lower() in HTML:
-        whole = "\n".join("\t".join(_cells_of_html(row)) for row in re.split(r"(?i)<tr\b", whole)[1:])
+        whole = "\n".join("\t".join(_cells_of_page(row)) for row in re.split(r"(?i)<tr\b", whole)[1:])
     text = FORTRAN.sub("e", NO_NUMBER.sub("", SEXAGESIMAL.sub(_decimal, whole)))
     mark = SEPARATORS.get(separator, separator.replace("\\t", "\t")) if separator else _separator(text)
     if len(mark) != 1:
@@ -231,12 +230,14 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
     return Grid(*_split(text, mark), notes, mark == " ")
 
 
-def _cells_of_html(row: str) -> Iterator[str]:
-    """Yield the cells of a row of an HTML table; one that spans several columns is followed by empty ones."""
-    for stated, inside in HTML_CELL.findall(row):
-        yield " ".join(unescape(re.sub(r"<[^>]*>", " ", inside)).split())
-        span = re.search(r"colspan\W+(\d{1,3})\b", stated, re.IGNORECASE)
-        yield from [""] * (int(span[1]) - 1 if span else 0)
+def _cells_of_page(row: str) -> Iterator[str]:
+    """Yield the cells of a row of an HTML table or of an OpenDocument sheet, where a number is not as it is shown."""
+    for stated, inside in CELL.findall(row):
+        value = re.search(r'office:value="([^"]*)', stated)
+        cell = value[1] if value else " ".join(unescape(re.sub(r"<[^>]*>", " ", inside)).split())
+        yield cell
+        span = re.search(r"(colspan|columns-repeated)\W+(\d{1,2})\b", stated, re.IGNORECASE)
+        yield from [cell if span[1] == "columns-repeated" else ""] * (int(span[2]) - 1) if span else ()
 
 
 def _decimal(angle: re.Match[str]) -> str:
@@ -295,9 +296,8 @@ def _separator(text: str) -> str:
     best = max(parted, key=parted.__getitem__)
     if blanks > BLANKS_CLEARLY * parted[best]:
         return " "
-    if not parted[best]:  # a header so wide that no row is seen
-        best = max(parted, key=lambda mark: sum(map(len, rows[mark])))
-    return best
+    # a header may be so wide that no row is seen
+    return best if parted[best] else max(parted, key=lambda mark: sum(map(len, rows[mark])))
 
 
 def _parted(row: Sequence[str]) -> int:
@@ -317,7 +317,7 @@ def list_of_numbers(cell: str) -> list[str]:
         return []
     cell = cell.lstrip(ascii_letters)  # array([1, 2, 3]), posj(1, 2, 3)
     parts = re.split(r"[\s\[\](){};]+" if ";" in cell else r"[\s\[\](){},]+", cell)  # else commas are decimal marks
-    numbers = [part for part in parts if part]
+    numbers = [part for part in parts if part and not NO_AXIS.fullmatch(part)]
     return numbers if len(numbers) > 1 and all(map(is_numeral, numbers)) else []
 
 
@@ -371,23 +371,16 @@ def _words(line: str) -> list[str]:
 
 
 def _excel(path: Path, sheet: str) -> Grid:
-    """Return the rows of a sheet of an Excel workbook: the stated one, or the first that has numbers."""
-    openpyxl = library("openpyxl", "Excel files")
+    """Return the rows of a sheet of a workbook (Excel, OpenDocument): the stated one, or the first that has numbers."""
     rows: list[tuple[int, list[str]]] = []
-    chosen = named = ""
+    chosen = ""
     try:
         with path.open("rb") as stream:
-            with ZipFile(stream) as archive:  # what it says of itself is what is read of it
-                size = sum(entry.file_size for entry in archive.infolist())
-            if size > LARGEST_WORKBOOK:
-                accepted = f"at most {LARGEST_WORKBOOK} bytes; more as .csv or .parquet"
-                raise InputError("the file", f"{size} bytes unpacked", accepted)
-            book = openpyxl.load_workbook(stream, read_only=True, data_only=True)
-            names = [each.title for each in book.worksheets]
+            sheets = _sheets(stream)
+            names = list(sheets)
             known = {str(i): name for i, name in enumerate(names, start=1)} | {name: name for name in names}
-            wanted = [pick(known, sheet, "--sheet")] if sheet else names
-            for named in wanted:
-                filled = list(_filled(book[named]))
+            for named in [pick(known, sheet, "--sheet")] if sheet else names:
+                filled = list(_filled(sheets[named]))
                 numeric = any(sum(map(is_numeral, row)) >= NUMBERS_OF_ROW for _, row in filled)
                 if filled and (numeric or not rows):
                     rows, chosen = filled, named
@@ -396,23 +389,38 @@ def _excel(path: Path, sheet: str) -> Grid:
     except InputError:
         raise
     except Exception as error:  # a broken file fails in zipfile, XML and openpyxl in many ways
-        raise InputError("the file", _first_line(error), "a readable Excel workbook (.xlsx)") from None
+        raise InputError("the file", _first_line(error), "a readable workbook (.xlsx, .ods)") from None
     how = "as requested" if sheet else "the first with numbers; another one, or several, by --sheet"
     notes = (f"sheet '{chosen}' of {', '.join(names)}: {how}.",) if len(names) > 1 else ()
     return Grid([row for _, row in rows], [number for number, _ in rows], notes)
 
 
-def _filled(sheet: Any) -> Iterator[tuple[int, list[str]]]:
+def _sheets(stream: BinaryIO) -> dict[str, Iterable[Iterable[Any]]]:
+    """Return the rows of the sheets of a workbook by their names."""
+    with ZipFile(stream) as archive:  # what it says of itself is what is read of it
+        size = sum(entry.file_size for entry in archive.infolist())
+        if size > LARGEST_WORKBOOK:
+            raise InputError("the file", f"{size} bytes unpacked", f"{LARGEST_WORKBOOK}, or more as .csv or .parquet")
+        if "content.xml" in archive.namelist():  # OpenDocument
+            named = re.split(r"<table:table\s[^<>]*table:name=\"([^\"]*)", archive.read("content.xml").decode())[1:]
+            rows = [map(_cells_of_page, re.split(r"<table:table-row\b", sheet)[1:]) for sheet in named[1::2]]
+            return dict(zip(map(unescape, named[::2]), rows, strict=True))
+    book = library("openpyxl", "Excel files").load_workbook(stream, read_only=True, data_only=True)
+    for sheet in book.worksheets:
+        sheet.reset_dimensions()  # what the file says of them would fill every row up
+    return {sheet.title: sheet.iter_rows(values_only=True) for sheet in book.worksheets}
+
+
+def _filled(rows: Iterable[Iterable[Any]]) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of a sheet that are not empty with their numbers; a sheet of few bytes may have cells anywhere."""
-    sheet.reset_dimensions()  # what the file says of them would fill every row up
-    for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
+    for number, row in enumerate(rows, start=1):
         if number > EXCEL_ROWS:
             raise InputError("the sheet", f"more than {EXCEL_ROWS} rows", "at most as many as Excel supports")
-        cells = ["" if value is None else str(value).strip() for value in row]
+        cells = ["" if value is None else str(value).strip() for value in islice(row, WIDEST + 1)]
         while cells and not cells[-1]:
             cells.pop()
         if len(cells) > WIDEST:
-            raise InputError("the table", f"a row of {len(cells)} cells", f"at most {WIDEST} columns")
+            raise InputError("the table", f"a row of more than {WIDEST} cells", f"at most {WIDEST} columns")
         if cells:
             yield number, cells
 

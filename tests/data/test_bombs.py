@@ -59,6 +59,7 @@ PROGRAMS = {
     "data.dtx": "<Value " * WIDE,
     "data.src": "PTP{" * WIDE,
     "data.dat": "POS a={" * WIDE,
+    "data.html": "<tr>" + "<td " * WIDE,
     "data.jbi": f"///POSTYPE ANGLE\nC1=1{' ' * WIDE}x\n",
 }
 

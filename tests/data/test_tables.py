@@ -253,7 +253,7 @@ def test_rows_at_the_same_joint_values_are_one_configuration() -> None:
 def test_excel_says_what_is_missing(monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "openpyxl", None)
     path = tmp_path / "data.xlsx"
-    path.write_bytes(b"")
+    path.write_bytes(b"PK\x05\x06" + bytes(18))  # an archive without entries
     with pytest.raises(
         ro.InputError, match=r"Excel files: found no package openpyxl.*pip install 'rpim-opt\[tables\]'"
     ):

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import json
+from itertools import groupby
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 from scipy.io import savemat
@@ -79,11 +81,33 @@ def samples() -> str:
     return "# collected by a script\nsamples:\n" + "".join(lines)
 
 
-def labview() -> str:
+def sheets(folder: Path, rows: dict[str, list[list[str]]]) -> Path:
+    """Write a spreadsheet as LibreOffice does: equal cells once with their number, numbers shown with one digit."""
+    content = ""
+    for name, lines in rows.items():
+        content += f'<table:table table:name="{name}" table:style-name="ta1"><table:table-column/>'
+        for line in lines:
+            content += "<table:table-row>"
+            for cell, equal in groupby(line):
+                repeated = f' table:number-columns-repeated="{len(list(equal))}"'
+                if cell.lstrip("-")[:1].isdigit():
+                    shown = f'office:value-type="float" office:value="{cell}"><text:p>{float(cell):.1f}'
+                else:
+                    shown = f'office:value-type="string"><text:p>{cell}'
+                content += f"<table:table-cell{repeated} {shown}</text:p></table:table-cell>"
+            content += '<table:table-cell table:number-columns-repeated="16374"/></table:table-row>'
+        content += "</table:table>"
+    path = folder / "raw.ods"
+    with ZipFile(path, "w") as archive:
+        archive.writestr("content.xml", f'<?xml version="1.0" encoding="UTF-8"?><office:body>{content}</office:body>')
+    return path
+
+
+def labview(times: bool = True) -> str:
     blocks = [["Channels", "9"], ["Samples", *["1"] * 9], ["Date", *["2024/03/14"] * 9], ["Y_Unit_Label", *["deg"] * 6, *["mm"] * 3],
               ["X0", *["0.0E+0"] * 9], ["Delta_X", *["1.000000"] * 9], ["***End_of_Header***"]]  # fmt: skip
     head = ["X_Value", *joint_names("J{}"), "X", "Y", "Z", "Comment"]
-    rows = beside([[f"{i}.000000"] for i in range(COUNT)], JOINTS, POINTS, [[""]] * COUNT)
+    rows = beside([[f"{i}.000000" if times else ""] for i in range(COUNT)], JOINTS, POINTS, [[""]] * COUNT)
     return "LabVIEW Measurement\t\nSeparator\tTab\n***End_of_Header***\t\n\t\n" + text([*blocks, head], rows, "\t")
 
 
@@ -178,6 +202,10 @@ FRESH: dict[str, Shape] = {
     "a row a joint": many(("axes.csv", text([["pose", "joint", "angle [deg]"]], JOINT_ROWS)), ("points.csv", text([["pose", *HEAD[7:]]], beside(NAMED, POINTS)))),
     "rows counted from 0 and from 1": many(("joints.csv", text([HEAD[:7]], beside([[str(i)] for i in range(COUNT)], JOINTS))), ("points.csv", text([[HEAD[0], *HEAD[7:]]], beside([[str(i + 1)] for i in range(COUNT)], POINTS)))),
     "LabVIEW": one(labview(), "raw.lvm", **BOTH),
+    "LabVIEW without times": one(labview(times=False), "raw.lvm", **BOTH),
+    "OpenDocument": (lambda folder: sheets(folder, {"Notes": [["cell 7"]], "Points": [HEAD, *ROWS]}), {}, "position"),
+    "OpenDocument, the second sheet": (lambda folder: sheets(folder, {"Old": [HEAD, *ROWS[:3]], "New": [HEAD, *ROWS]}), {"sheet": "New"}, "position"),
+    "RAPID, a jointtarget in a cell": one(text([["Point", "JointTarget", *HEAD[7:]]], [[label, f'"[[{",".join(q)}],[9E+09,9E9,9E+09,9E+09,9E+09,9E+09]]"', *p] for label, q, p in zip(LABELS, JOINTS, POINTS, strict=True)]), units="deg"),
     "TUM trajectory, joints by time": many(("trajectory.txt", trajectory()), ("joints.csv", clocked_joints()), kind="pose", **IN_SI),
     "KUKA trace beside a tracker": one(trace(), **BOTH),
 }  # fmt: skip
