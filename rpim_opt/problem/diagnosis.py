@@ -54,7 +54,7 @@ ON_GRID = 2e-4  # part of a step by which rounded values may miss it, for their 
 NARROWER, GRID = 0.25, 61
 """Factor by which the grid for a joint's values gets narrower from round to round, and its points."""
 SEVERAL = 0.85  # several joint zeros moved, if that leaves less than this part of what one move leaves
-LOOSE = 1e-3  # backlash of a joint [rad, m] that no gear in order has: a tenth of that is usual
+LOOSE = 5e-4  # backlash of a joint [rad, m] that no gear in order has: a fifth of that is usual
 FLAT_TURN = 0.05
 """Part of their distance by which two places of a reflector differ in height and radius, if a joint turned it."""
 ANOTHER = 0.01  # joint movement [rad, m] after which no point is measured again to the last digit
@@ -458,8 +458,8 @@ def odd_column(problem: CalibrationProblem) -> Iterator[str]:
         return
     found = list(_odd_values(problem, points))
     unsigned = [axis for axis, k in zip("xyz", _unsigned(points.y), strict=True) if k]
-    if not found and unsigned:
-        yield f"no value of column {joined(unsigned)} is negative, and some are near zero: were signs lost?"
+    if not found and len(unsigned) > 1:  # the signs of one alone would be values that fit
+        yield f"no value of columns {joined(unsigned)} is negative, and some are near zero: were signs lost?"
     yield from found
 
 
@@ -521,7 +521,7 @@ def other_readings(problem: CalibrationProblem, most: float = np.inf) -> list[st
     """Return what explains a table better than it is stated: another place or interpretation of some rows, or of all.
 
     Where half of the rows agree with the nominal robot, another interpretation is sought of the others first. One of
-    all rows leaves errors of at most ``most`` [m] by the nominal robot.
+    all rows leaves errors of at most ``most`` [m] by the nominal robot, or a robot's part of the points' extent.
     """
     points = points_of(problem) or lengths_of(problem)
     if points is None:
@@ -529,7 +529,7 @@ def other_readings(problem: CalibrationProblem, most: float = np.inf) -> list[st
 
     def of_all() -> Iterator[str]:
         better = better_reading(problem)
-        if better is not None and better.left <= most:
+        if better is not None and better.left <= max(most, REACH * points.extent):  # the arm's unit may be wrong
             yield better.sentence
 
     both = [of_all(), other_rows(problem)]

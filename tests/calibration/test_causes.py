@@ -701,6 +701,21 @@ def test_backlash_of_one_joint_is_that_of_no_second_one() -> None:
     assert said.startswith("backlash, joint 2 by 1.5 mrad: one of two positions")
 
 
+def test_backlash_is_named_from_half_a_milliradian_on() -> None:
+    """Of 0.9 mrad, three times the lost motion of a geared joint in order, nothing was said before."""
+    sides = 0.45e-3 * np.random.default_rng(5).choice([-1, 1], 60)
+    result = ro.calibrate(of_joint(1, lambda q: q + sides)(simulated_arm("irb120", count=60)), ro.tikhonov, 1.0)
+    assert likely_causes(result)[1].startswith("Likely: backlash, joint 2 by 0.9")
+
+
+@pytest.mark.slow
+def test_the_unit_of_the_robots_file_is_named_where_parameters_take_the_error_up() -> None:
+    """What is left is measured by the points, as 0.3 % of an arm in inches is less than a robot's errors."""
+    wrong = mistakes.dh_table(lambda mdh: mdh / [1, 25.4, 1, 25.4, 1])(simulated_arm("irb120"))
+    causes = likely_causes(ro.calibrate(wrong, ro.tikhonov, 1e-6))
+    assert "or correct the robot's file, if its unit is wrong" in causes[1]
+
+
 @pytest.mark.slow
 def test_a_size_of_the_points_is_no_cause_where_wrong_lengths_explain_them(monkeypatch) -> None:
     """Of a longer variant's DH table: points a third larger would fit seven times better, and be wrong."""

@@ -95,8 +95,11 @@ def test_copied_values_limits_and_coverage() -> None:
 
 def test_columns_without_a_negative_value_are_named() -> None:
     assert list(odd_column(changed("position"))) == []
+    assert (
+        list(odd_column(changed("position", y=lambda y: y - [0, 0, y[:, 2].min()]))) == []
+    )  # z above the lowest point
     assert list(odd_column(changed("position", y=lambda y: np.abs(y - y.mean(axis=0))))) == [
-        "no value of column x, y and z is negative, and some are near zero: were signs lost?"
+        "no value of columns x, y and z is negative, and some are near zero: were signs lost?"
     ]
     far = changed("position", y=lambda y: np.random.default_rng(1).permutation(y) - y.min(axis=0) + 0.5)
     assert list(odd_column(far)) == []

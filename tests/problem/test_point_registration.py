@@ -30,6 +30,20 @@ def measured(count: int = 24, moved: float = 0.0, seed: int = 0) -> Points:
     return Points(ARM, q, y, marker, TOOLS + moved * rng.uniform(-1, 1, (2, 3)), None, np.arange(count))
 
 
+def test_a_reflector_is_where_it_is_stated_unless_that_is_beyond_any_arm() -> None:
+    """A robot's file in millimetres has a tip a hundred metres from the flange; its points were not recognized."""
+    problem = ro.load("position").problem
+    for factor, kept in ((1.0, True), (1e3, True), (1.0, False)):
+        tool = 90.0 if not kept else 0.09 * factor
+        nominal = problem.parameters.nominal.copy()
+        nominal[problem.parameters.frame("tool_")[:3]] = 0.0, 0.0, tool
+        parameters = replace(problem.parameters, nominal=nominal)
+        robot = replace(problem.robot, mdh=problem.robot.mdh * [1, factor, 1, factor, 1])
+        points = points_of(replace(problem, robots=robot, parameters=parameters))
+        assert points is not None
+        assert points.tools[0, 2] == tool * kept
+
+
 @pytest.mark.parametrize("moved", [0.0, 0.003])
 def test_base_and_reflectors_come_back(moved: float) -> None:
     points = measured(moved=moved)
