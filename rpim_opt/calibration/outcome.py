@@ -121,11 +121,8 @@ class Outcome:
         hold for the robot, times the residuals' variance where that is larger than the noise. Of a robust loss they
         are the squares of what it keeps without constraints.
         """
-        program, constraints = self.program, self.formulation.constraints
-        if not (constraints and self.formulation.solvable and program.linear_penalty):
-            return ""
-        tangent = program.tangent(self.z, self.weight)
-        if tangent is None:
+        program = self.program
+        if not (self.formulation.solvable and program.linear_penalty) or self.moves is None:
             return ""
         bare = pose(replace(program.formulation, constraints=()), program.model)
         try:
@@ -136,11 +133,11 @@ class Outcome:
         sums = [float(np.sum((kept.A @ z - kept.b) ** 2)) + kept.offset for z in (self.z, best)]
         penalties = [self.penalty_weight * bare.value(z, self.weight)[1] for z in (self.z, best)]
         held, without = np.add(sums, penalties).tolist()
-        active = len(self.z) - tangent.shape[1]
+        active = len(self.z) - self.moves.shape[1]
         variance = max(1.0, without / max(program.model.equations - len(self.z), 1))
         if chdtrc(active, max(held - without, 0.0) / variance) > CONTRADICTED:
             return ""
-        names = joined([name_of(constraint, k) for k, constraint in enumerate(constraints)])
+        names = joined([name_of(constraint, k) for k, constraint in enumerate(self.formulation.constraints)])
         return (
             f"The data contradict constraints ({names}): without them the objective is {three_digits(without)} instead "
             f"of {three_digits(held)}. Standard deviations and intervals are conditional on them and too small; check "
