@@ -551,7 +551,7 @@ def _held(result: Outcome, problem: CalibrationProblem) -> list[str]:
 
 
 def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: np.ndarray) -> list[str]:
-    """Say that loss, penalty or constraints leave what a squared penalty at weight 1 explains."""
+    """Say that loss, penalty or constraints leave what a squared penalty at weight 1 explains of the same rows."""
     if kept.mean() < 1 - EXCLUDED:  # downweighted by a fit that is wrong everywhere
         kept = np.ones_like(kept)
     rows, x = problem.on(problem.data.take(np.flatnonzero(kept))), result.x
@@ -564,15 +564,16 @@ def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: 
     away = sorted(set(problem.labels).difference(rows.labels))
     if away and by_place(result.formulation, problem.groups):
         return [f"outliers bias a loss that depends on the order of its equations: leave out {listed(away)}."]
-    if outliers:
+    if away and not result.squared_loss:
         x = rows.parameters.free.scale * pose(result.formulation, rows.linearize(x)).solve(result.weight).z
     before, now = (_worst_ratio(rows, each) for each in (result.x, x))
     if now < max(NOTICED * plain, before / NOISY):  # outliers limited it
         return []
     names = [name_of(constraint, k) for k, constraint in enumerate(result.formulation.constraints)]
+    beside = f" without outliers ({listed(away)})" if away else ""
     remedy = f"Loosen its constraints ({joined(names)}) or use" if names else "Use"
     return [
-        f"{LIMITED}: residuals are {three_digits(now)} times the measurement "
+        f"{LIMITED}: residuals{beside} are {three_digits(now)} times the measurement "
         f"noise, but {three_digits(plain)} times with a squared penalty at weight 1 and no constraint. {remedy} a "
         "smaller weight."
     ]
@@ -646,18 +647,19 @@ def _without_outliers(
     errors, own = ordered.errors(result.x), np.isin(ordered.labels, list(kept))
     largest = np.nan_to_num(errors[own]).max()
     alone = ordered.on(ordered.data.take(np.flatnonzero(own | (errors <= largest))))
-    return alone, ridge_deviations(alone) if again and result.single and result.squared_loss else result.x
+    return alone, ridge_deviations(alone) if again and result.single else result.x
 
 
 def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Iterator[str]:
-    """Say that outliers make a loss fit badly, if all is well without them, else what other residuals show."""
+    """Say that outliers make a loss fit badly what it fits without them, else what other residuals show."""
     alone, x = _without_outliers(result, ordered)
     single = [flag.label for flag in result.single]
-    ratio, before = _worst_ratio(alone, x), _worst_ratio(ordered, result.x)
-    if single and result.squared_loss and ratio <= min(NOISY, diagnosis.MOVED**0.5 * before):
+    ratio, before = _worst_ratio(alone, x), _worst_ratio(ordered if result.squared_loss else alone, result.x)
+    loss = "a squared loss" if result.squared_loss else "this loss"
+    if single and ratio <= min(NOISY, diagnosis.MOVED**0.5 * before):
         yield (
             f"outliers ({listed(single)}): without them residuals are {three_digits(ratio)} times the measurement "
-            "noise. They bias a squared loss: use formulation 'robust', or leave them out ([exclude])."
+            f"noise. They bias {loss}: use formulation 'robust', or leave them out ([exclude])."
         )
         return
     yield from first(diagnosis.shown_by_residuals(alone, x), _in_place_of_extensions(result, alone))

@@ -326,6 +326,18 @@ def test_outliers_that_bias_a_loss_of_ones_own_are_named_and_not_the_formulation
         assert "rows c1, c7, c14, c39 and c43 scatter" in reason
 
 
+def test_outliers_are_the_cause_where_the_same_rows_without_them_fit_a_loss_of_ones_own() -> None:
+    """Its residuals with outliers were compared with those of a squared penalty without, and a weight was blamed."""
+    lopsided = ro.Formulation("lopsided", lambda r: cp.sum_squares(cp.pos(r)) + 4 * cp.sum_squares(cp.neg(r)))
+    errors = np.zeros((40, 3))
+    errors[[3, 7]] = 3e-3 * np.random.default_rng(0).normal(size=(2, 3))
+    wrong = values(lambda y: y + errors)
+    result = ro.calibrate(wrong(ro.load("position").problem), replace(lopsided, penalty=cp.sum_squares), 1.0)
+    (reason,) = result.verdict.reasons
+    assert reason.startswith("Likely: outliers (c7, c3): without them residuals are 0.8")
+    assert "They bias this loss: use formulation 'robust'" in reason
+
+
 def test_a_loss_that_knows_its_equations_keeps_outliers_and_says_so() -> None:
     """Without six equations an index array failed, and slices took the next session's: a weight of one half."""
     problem = values(lambda y: y + 5e-3 * np.isin(np.arange(len(y)), [3, 7])[:, None])(ro.load("position").problem)
