@@ -25,7 +25,7 @@ from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.registration.points import FAR, Fit, Points, agreeing, fit_points, lengths_of, misfit, points_of
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.mdh import Robot, numbered
-from rpim_opt.robot.parameters import tool_prefix
+from rpim_opt.robot.parameters import of_session, tool_prefix
 
 LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}  # a joint that moves less [rad, m] is hardly seen
 ALIKE = (0.4, 2.5)  # rounding explains errors that are between these multiples of what it makes
@@ -715,7 +715,7 @@ def _explained(
         tried.append(((whole - gain) / spare * odds, gain, addition, step))
     if not tried or not whole:
         return None
-    _, gain, addition, step = min(tried, key=lambda each: each[0])
+    _, gain, addition, step = min(tried, key=lambda each: round(each[0] / whole, 9))  # of equal ones the first
     spare = max((len(model.A) - taken - len(step)) / max(uneven, 1.0), 1)
     left = max(whole - gain, 1e-300)
     chance = fdtrc(len(step), spare, gain / len(step) / (left / spare))
@@ -745,13 +745,14 @@ def _without_parameters(model: LinearModel) -> Callable[[Array], Array]:
 def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | None = None) -> Iterator[str]:
     """Report what one addition to the linearization at x (n,) explains best: what moved, lags or is scaled.
 
-    Added are the columns of a base, fixture, reflector or joint zero for the rows from one on, or between two of a few,
-    of a joint zero from a value of the joint on as well, and of a reflector by the direction of gravity at the flange;
-    the slope of a joint's zero times the value of a joint, all of these times the way from the row before, and the
-    slopes of the scale or offset of lengths, of positions by the scales and skews of their axes, too. Else backlash,
-    rows of two kinds, noise of one column and of some rows are looked for. Nothing is reported where gravity and
-    eccentric gears explain more, which are not in the model: a lack of fit, and no mistake. With ``most`` the addition
-    is reported if it leaves at most that part of the squares, and nothing else is looked for.
+    Added are the columns of a base for every session; of a base, fixture, reflector or joint zero for the rows from one
+    on, or between two of a few, of a joint zero from a value of the joint on as well, and of a reflector by the
+    direction of gravity at the flange; the slope of a joint's zero times the value of a joint, all of these times the
+    way from the row before, and the slopes of the scale or offset of lengths, of positions by the scales and skews of
+    their axes, too. Else backlash, rows of two kinds, noise of one column and of some rows are looked for. Nothing is
+    reported where gravity and eccentric gears explain more, which are not in the model: a lack of fit, and no mistake.
+    With ``most`` the addition is reported if it leaves at most that part of the squares, and nothing else is looked
+    for.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
@@ -826,6 +827,13 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
     there[p.identified[whole.parameters.identified]] = x
     A = whole.linearize(there).A
     shares = _shares(problem)
+    free, named = whole.parameters.free, problem.data.sessions
+    base = np.flatnonzero(np.isin(free.names, SHIFTED))
+    if len(base) and 1 < len(named) <= len(problem.data) / FEWEST and not any(map(of_session, free.names)):
+        apart = A[:, base, None] * (problem.data.session[problem.owners, None] == np.array(named[1:]))[:, None]
+        between = f"the base differs from session to session ({listed(named)})"
+        remedy = 'did it move between them? Add `session_*` to `identify`, or model = "auto"'
+        yield Addition(apart.reshape(len(A), -1), lambda c: (between, remedy))
     for what, (changed, cause) in parts.items():
         yield from _changes(whole, there, A, changed, what, cause, shares)
     for i, name in enumerate(_zeros(problem.robot)):
@@ -840,7 +848,6 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
     }
     cause = "is it loose in its nest, or its holder soft"
     yield from _changes(whole, there, A, [tool_prefix(m) + c for m in markers for c in "xyz"], "reflector", cause, down)
-    free = whole.parameters.free
     for family in (bends, eccentric, bends | eccentric):  # either alone explains more with fewer columns
         lacking = np.isin(free.names, every[family & ~p.identified])
         if lacking.any():
@@ -852,7 +859,6 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
     warm = "did it warm up? Measure it warm, or in random order, or state temperature_C of every row (expansion)"
     what = "the arm grows from row to row, by {} from the first to the last"
     yield Addition(grown[:, None], lambda c: (what.format(f"{100 * c[0]:.2g} %"), warm))
-    base = np.flatnonzero(np.isin(free.names, SHIFTED))
     q = problem.joint_values[:, np.ptp(problem.joint_values, axis=0) > 0]
     if len(q) < 2 * FEWEST or not len(base):
         return
@@ -860,8 +866,8 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
     if steps.min(initial=1.0) > JUMPING:  # else model errors follow the rows as well
         courses = np.cos(np.pi * np.outer(elapsed, range(1, COURSES + 1)))
         slow = "the instrument or the base drifted slowly, though the joint values are in no order"
-        remedy = "temperature? Measure reference points between the rows, or all in a shorter time"
-        yield Addition((A[:, base, None] * courses[:, None]).reshape(len(A), -1), lambda c: (slow, remedy))
+        still = "temperature? Measure reference points between the rows, or all in a shorter time"
+        yield Addition((A[:, base, None] * courses[:, None]).reshape(len(A), -1), lambda c: (slow, still))
 
 
 def _changes(

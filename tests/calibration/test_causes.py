@@ -327,6 +327,19 @@ def test_what_hides_in_the_noise_is_named_beside_a_delivered_robot(monkeypatch, 
     assert re.search(f"\nSlight, but significant: .*{said}", capsys.readouterr().out)
 
 
+@pytest.mark.parametrize("days", [2, 3])
+def test_a_base_that_moved_between_stated_sessions_is_named_by_them(days: int) -> None:
+    """It was a slow drift, or a row from which on they should have been named as they were."""
+    problem = simulated_arm("ur5e", count=60)
+    at = np.repeat(np.arange(days), 60 // days)
+    (block,) = values(lambda y: y + 6e-4 * np.array([[0, 0, 0], [1, -1, 0.5], [-1, 1, 0.5]])[at])(problem).data.blocks
+    sessions = np.array([f"day {k + 1}" for k in at], dtype=object)
+    moved = problem.on(replace(problem.data, blocks=(replace(block, session=sessions),)))
+    causes = likely_causes(ro.calibrate(moved, weight=1.0))
+    assert any("the base differs from session to session (day 1, day 2" in text for text in causes), causes
+    assert any("Add `session_*` to `identify`" in text for text in causes), causes
+
+
 def test_joint_values_that_were_logged_as_16_bit_floats_are_named() -> None:
     coarse = joints(lambda q: np.radians(np.degrees(q).astype(np.float16).astype(float)))
     result = ro.calibrate(coarse(simulated_arm("ur5e", count=80)))
