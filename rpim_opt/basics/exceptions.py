@@ -96,23 +96,21 @@ class RowError(InputError):
 class Conflict(NamedTuple):
     """Contradictory constraints: how far to loosen bounds of parameters and ``stated`` constraints [SI].
 
-    ``constraints`` are those that cannot hold together, of which none can be left out.
+    ``constraints`` are those that cannot hold together, of which none can be left out; ``loosen`` are the same sizes as
+    texts, those of parameters and of statements.
     """
 
     parameters: dict[str, float]
     constraints: tuple[str, ...] = ()
     stated: Mapping[str, float] = MappingProxyType({})
+    loosen: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         """Return the contradiction as a sentence; empty if there is none."""
         parts = []
         if self.constraints:
             parts.append(f"these constraints contradict each other: {', '.join(self.constraints)}")
-        for bounds in (self.parameters, self.stated):
-            if bounds:
-                by = ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in bounds.items())
-                parts.append(f"loosen {by}")
-        return "; ".join(parts)
+        return "; ".join([*parts, *(f"loosen {each}" for each in self.loosen)])
 
 
 class NoSolutionFound(RpimError):

@@ -47,9 +47,17 @@ def conflict(structure: Structure) -> Conflict | None:
         slacks.append(np.zeros(count) if slack.value is None else np.asarray(slack.value)[:count])
     by_box, by_statement = slacks
     bounds = {parameters.names[i]: float(by_box[i] * parameters.scale[i]) for i in np.flatnonzero(by_box > LEAST)}
-    pairs = zip(parsed, by_statement, strict=True)
-    statements = {each.name: float(each.scale(parameters) * by) for each, by in pairs if by > LEAST}
-    return Conflict(bounds, tuple(condition.name for condition in left), statements)
+    dimension = dict(zip(parameters.names, parameters.dimensions, strict=True))
+    texts = [", ".join(f"{name} by {as_text(by, dimension[name])}" for name, by in bounds.items())]
+    statements: dict[str, float] = {}
+    by_unit = []
+    for each, by in zip(parsed, by_statement, strict=True):
+        if by > LEAST:
+            statements[each.name] = float(each.scale(parameters) * by)
+            unit, si = each.unit
+            by_unit.append(f"{each.name} by {statements[each.name] / si:.4g} {unit}")
+    texts.append(", ".join(by_unit))
+    return Conflict(bounds, tuple(condition.name for condition in left), statements, tuple(filter(None, texts)))
 
 
 def _demands(conditions: list[Condition]) -> list[Any]:
@@ -91,8 +99,8 @@ def _conditions(structure: Structure, z: cp.Variable, boxes: Any = 0, statements
     return made
 
 
-def advice(structure: Structure, status: str, found: Conflict | None) -> str:
-    """Return a sentence on why a program was not solved, with a remedy."""
+def advice(structure: Structure, status: str, found: Conflict | None, solver: str) -> str:
+    """Return a sentence on why a program was not solved by a solver of CVXPY, with a remedy."""
     if found is not None:
         return ""
     if status.startswith("unbounded"):
@@ -100,6 +108,8 @@ def advice(structure: Structure, status: str, found: Conflict | None) -> str:
             "the objective appears to be unbounded below: bound a linear loss or a variable of your own that no term "
             "penalizes, or use a larger weight"
         )
+    if solver.upper() != cp.CLARABEL:
+        return f"the program may be beyond {solver}, or beyond its accuracy: tighten its settings, or use CLARABEL"
     if structure.constrained and status.startswith(("infeasible", "optimal")):
         return (
             "its constraints are feasible, but not to the solver's accuracy: check their units, or loosen them slightly"

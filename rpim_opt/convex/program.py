@@ -562,20 +562,20 @@ class Program(Brief):
                     raise
                 raise InputError("settings", f"{error}".rstrip("."), f"settings that {solver} knows") from None
             except (cp.SolverError, ValueError, ArithmeticError, RuntimeError) as error:  # solvers have their own
-                raise self._failure(first or f"an error of {solver}: {error}", weight) from None
+                raise self._failure(first or f"an error of {solver}: {error}", weight, solver) from None
         if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or z.value is None:
-            raise self._failure(first or problem.status, weight)
+            raise self._failure(first or problem.status, weight, solver)
         point = np.array(z.value)
         missed = self.violation(point)
         if missed > feasibility_tolerance(point):
-            raise self._failure(f"{problem.status}, but violates the constraints by {missed:.1e}", weight)
+            raise self._failure(f"{problem.status}, but violates the constraints by {missed:.1e}", weight, solver)
         values = [[np.ravel(np.asarray(c.dual_value, dtype=float)) for c in group] for group in groups]
         iterations = int(problem.solver_stats.num_iters or 0)
         multipliers = partial(self._by_function, values)
         return replace(self._at(point, weight, multipliers, iterations), status=problem.status)
 
-    def _failure(self, status: str, weight: float) -> NoSolutionFound:
-        """Return why there is no solution."""
+    def _failure(self, status: str, weight: float, solver: str) -> NoSolutionFound:
+        """Return why a solver of CVXPY found no solution."""
         from rpim_opt.convex.infeasible import advice, conflict  # of programs without a solution
 
         contradiction = None
@@ -583,7 +583,7 @@ class Program(Brief):
             contradiction = conflict(self.structure)
         elif status.startswith("infeasible"):
             status = "stalled"  # a program without constraints always has a point
-        text = advice(self.structure, status, contradiction)
+        text = advice(self.structure, status, contradiction, solver)
         return NoSolutionFound(self.formulation.name, weight, status, contradiction, text)
 
 

@@ -153,6 +153,10 @@ def test_a_folder_learns_from_a_population(folder: Path) -> None:
         ("[prior.scale]\ntheta5_mrad = true", "key prior.scale.theta5_mrad: found True"),
         ("frames = -1", "key prior.frames"),
         ("[prior.scale]\ntheta5 = 1.0", "table scale, key theta5"),
+        (
+            '[prior.scale]\n"thta?_mrad" = 1.0',
+            "key thta?_mrad: found 'thta?', which fits no parameter, accepted: theta1,",
+        ),
         ("[prior.centre]\ntheta55_mrad = 1.0", "unknown key 'theta55_mrad'"),
         ('groups = ["b?"]', "key groups"),
         ('from = "nowhere.json"', "nowhere.json"),
