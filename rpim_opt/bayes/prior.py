@@ -141,6 +141,18 @@ class Prior:
         centre, width = population(results)
         return cls(centre=centre, scale=width, optional=tuple(centre))
 
+    def where_known(self, stated: Parameters, found: Parameters) -> Parameters:
+        """Return the table that was found, with what `known` combinations name where it is stated.
+
+        Of an orientation, and of frames with a scale of their own that is no wider than that of the table, too.
+        """
+        own = overlay(stated, np.full(len(stated), np.nan), self.scale, "prior, table scale")
+        known = {name for each in self.statements if not each.whole for name in each.names}
+        known |= set(np.array(stated.names)[stated.placed & (own <= stated.scale)].tolist())
+        known |= {name[:-1] + axis for name in known for axis in "xyz" if name[:-1].endswith("_r")}
+        kept = np.isin(stated.names, list(known))
+        return replace(found, nominal=np.where(kept, stated.nominal, found.nominal))
+
     def without_optional(self) -> Prior:
         """Return the prior without what is optional."""
         centre, scale = (

@@ -105,8 +105,8 @@ def calibrate(
     start
         (n,) deviations [SI] to begin with; nominal by default. Then signs and zeros of joints are sought where the
         nominal robot does not explain the data (`global_start`), and frames that are stated metres or half a turn from
-        their registration start there (`frames.relocated`). The result does not depend on a stated start, as long as
-        the loop converges.
+        their registration start there (`frames.relocated`), but for what the prior knows. The result does not depend on
+        a stated start, as long as the loop converges.
     max_iterations, tolerance
         When to stop: linearizations, and length of a step. ``converged`` and ``message``
         of the result report how the loop ended.
@@ -148,11 +148,14 @@ def calibrate(
     if start is not None:
         start = finite_numbers("start", start, (len(problem.parameters.free),))
     else:
+        as_stated = problem.parameters
         if (found := find_mapping(problem)) is not None:
             mapping, problem = found
             prior = (prior or Prior()) & _wide_zeros(mapping)
         if (elsewhere := relocated(problem)) is not None:
             stated, problem = problem, elsewhere
+        if prior is not None:
+            problem = problem.with_parameters(prior.where_known(as_stated, problem.parameters))
     again: Callable[..., Calibration] = partial(
         calibrate,
         formulation=formulation,

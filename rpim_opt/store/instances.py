@@ -132,6 +132,10 @@ def load(
             problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
         formulation = _formulation(definition, problem)
         prior = problem_file.stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
+        nominal = [name for each in prior.statements if each.reference is None for name in each.names]
+        if definition.base is None and (registered := [name for name in nominal if name.startswith("base_")]):
+            found = f"'{registered[0]}' without a value, where base = \"auto\""
+            raise InputError("key prior.known", found, f"'{registered[0]} = ... +- ...', or a table [base]")
         details = problem_file.stated_details(table.record)
         with problem_file.at_key("reading", path, part=True):
             TableOptions.stated(table.reading)

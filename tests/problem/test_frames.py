@@ -86,6 +86,24 @@ def test_a_base_metres_and_half_a_turn_off_does_not_matter(turn: float, axis: in
     assert far.errors().mean() == pytest.approx(near.errors().mean(), rel=0.02)
 
 
+@pytest.mark.parametrize("known", ["base_rz +- 0.5 mrad", "base_rz = 0 +- 0.5 mrad"])
+def test_a_known_base_is_not_registered_again_where_a_joint_zero_is_off(known: str) -> None:
+    problem, truth = simulated(noise=3e-5, seed=3)
+    names = problem.parameters.free.names
+    truth = np.where([name.startswith("base_") for name in names], 0.0, truth)
+    zero = names.index("theta1")
+    truth[zero] = 0.8  # far beyond what registration takes for a start, and exactly a turn of the base
+    y = problem.data.blocks[0].y + (problem.residual(np.zeros(len(truth))) - problem.residual(truth)).reshape(-1, 3)
+    prior = ro.bayes.Prior.known(known)
+    for name in ("base_x +- 0.1 mm", "base_y +- 0.1 mm", "base_z +- 0.1 mm", "base_rx +- 0.5 mrad"):
+        prior &= ro.bayes.Prior.known(name)
+    result = ro.calibrate(problem.on(ro.Dataset.of(problem.data.q, y, 5e-5)), prior=prior)
+    values = result.problem.parameters.by_name(result.x)
+    assert result.converged
+    assert abs(values["base_rz"]) < 4 * 0.5e-3
+    assert values["theta1"] - ARM.mdh[0, 2] == pytest.approx(0.8, abs=0.004)
+
+
 def test_a_base_nobody_knows_is_registered() -> None:
     instance = ro.load("position")
     p = instance.problem.parameters

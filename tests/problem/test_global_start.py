@@ -146,6 +146,23 @@ def test_poses_show_signs_and_zeros() -> None:
     assert error(result, unseen) < 1.2 * error(ro.calibrate(truth), unseen)
 
 
+@pytest.mark.slow
+def test_a_known_base_stays_where_it_is_stated_and_joint_1_takes_up_its_zero() -> None:
+    problem, *_ = simulated("hobby", 2, kind="pose")
+    base = dict(zip(("x", "y", "z", "rx", "ry", "rz"), (1.2, -0.7, 0.35, 0.2, -0.4, 1.1), strict=True))
+    nominal = problem.parameters.nominal.copy()
+    known = ro.bayes.Prior()
+    for axis, value in base.items():
+        nominal[problem.parameters.names.index(f"base_{axis}")] = value
+        known &= ro.bayes.Prior.known(f"base_{axis} +- 1 {'mrad' if 'r' in axis else 'mm'}")
+    problem = replace(problem, parameters=replace(problem.parameters, nominal=nominal))
+    result = ro.calibrate(problem, prior=known)
+    values = result.problem.parameters.by_name(result.x)
+    assert result.mapping is not None
+    assert result.converged
+    assert [values[f"base_{axis}"] for axis in base] == pytest.approx(list(base.values()), abs=0.005)
+
+
 @pytest.mark.parametrize("name", ["scara", pytest.param("ur5e", marks=pytest.mark.slow)])
 def test_lengths_show_signs_and_zeros_but_not_which_of_two_mirror_images(name: str) -> None:
     """A draw-wire whose anchor is not known; held-out lengths are as with the truth stated, for both images."""

@@ -164,6 +164,7 @@ def test_a_folder_learns_from_a_population(folder: Path) -> None:
         ('population = ["robot.toml"]', "robot.toml"),
         ("inflate = 2", "no key from in addition"),
         ('form = "x.json"', "from"),
+        ('known = ["base_x +- 1 mm"]', "found 'base_x' without a value, where base = \"auto\""),
     ],
 )
 def test_a_wrong_prior_is_refused_by_file_and_key(folder: Path, text: str, says: str) -> None:
