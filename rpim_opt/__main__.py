@@ -1,4 +1,4 @@
-"""Entry point of the program, with a one-word exit on interrupt, even during start-up."""
+"""Entry point of the program: an interrupt ends it without a traceback, even during start-up."""
 
 import sys
 

@@ -136,7 +136,7 @@ Convention = Annotated[str, Option(help="Convention of --mdh: modified (Craig), 
 TIP = "The reflector is the tip link: write its identified pose."
 PERMITTED = "Largest permitted error [mm]: exit code 1 if exceeded; default: the result's limit."
 REMAINING = "Largest residual error plus its U (k = 2) [mm]: exit code 1 above; default: the result's limit."
-ORIENTATION = "Correct orientations, or ignore them; default: correct if known better than the nominal ones."
+ORIENTATION = "Correct orientations, or ignore them; default: correct if by more than their standard uncertainty."
 Workers = Annotated[int, Option(help="Number of parallel processes.")]
 Resume = Annotated[Choice, Option(help="Resume an interrupted run, or discard it and start again.")]
 Table = Annotated[File, Option(help="CSV file for the rows.")]
@@ -157,7 +157,7 @@ Code = Annotated[bool, Option("--allow-code", help="Allow running the folder's P
 
 
 class Answer(NamedTuple):
-    """The result of a command: text and document, exit code, files written, and how its tables were read."""
+    """Output of a command: text and document, exit code, files written, and notes on reading its tables."""
 
     text: object
     document: dict[str, Any]
@@ -211,7 +211,7 @@ CODELESS = ("new", "iso9283", "study", "robots")  # commands that read no folder
 
 
 def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
-    """Add a command: its answer is printed, as text or with --json as a document, and decides the exit code.
+    """Add a command: its output is printed, as text or with --json as a document, and decides the exit code.
 
     A parameter ``tables`` stands for the options of `Tables`, ``as_json`` for --json; a command that runs a folder's
     code takes --allow-code.
@@ -305,11 +305,11 @@ def calibrate(
     problem: Problem,
     variant: Variant = None,
     selector: Annotated[Text, Option(help=RULES)] = None,
-    model: Annotated[Text, Option(help="auto: extensions by evidence; geometry: none.")] = None,
+    model: Annotated[Text, Option(help="auto selects extensions; geometry has none.")] = None,
     formulation: Annotated[Text, Option(help=READY)] = None,
     noise: Annotated[Text, Option(help=PARTS)] = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
-    use_validation: Annotated[Choice, Option(help="Refit with validation rows too; default: if held out.")] = None,
+    use_validation: Annotated[Choice, Option(help="Refit with validation rows; default: after new --hold-out.")] = None,
     limit: Tolerance = None,
     box: Box = None,
     measured: Measured = None,
@@ -675,7 +675,7 @@ def study(
 
 @command
 def compare(
-    problems: Annotated[list[str], Argument(help="Problem folders, shipped names, a folder of problem folders.")],
+    problems: Annotated[list[str], Argument(help="Problem folders, a folder of them, or shipped problems.")],
     formulations: Annotated[str, Option(help="tikhonov,robust,...; folder: each problem's own.")] = "tikhonov",
     selector: Annotated[str, Option(help="learned,reml,l_curve,1.0,...: rules and weights.")] = "learned",
     methods: Annotated[str, Option(help="Baselines: nominal,levenberg_marquardt,...")] = "",

@@ -96,7 +96,7 @@ class TableOptions:
 
     @classmethod
     def stated(cls, texts: Mapping[str, str]) -> TableOptions:
-        """Return the options from their texts, as in ``[reading]`` of a problem file."""
+        """Return the options from texts, as in ``[reading]`` of a problem file."""
         for name in texts:
             pick(cls.__dataclass_fields__, name, "key reading")
         options: dict[str, Any] = dict(texts)

@@ -69,7 +69,7 @@ class ScaledPrior:
         return not informative and bool((self.scale == 1).all())
 
     def inside(self, size: Array) -> ScaledPrior:
-        """Return the same for parameters whose scales have been multiplied by ``size`` (n,): ``scale`` is 1 there."""
+        """Return the prior in units of scales that were multiplied by ``size`` (n,), in which ``scale`` is 1."""
         larger = replace(self.parameters, scale=self.parameters.scale * size)
         ones = np.ones_like(self.scale)
         return replace(self, parameters=larger, centre=self.centre / size, scale=ones, rows=self.rows * size)
@@ -139,7 +139,7 @@ class _Penalty(Ready):
 
     @cached_property
     def quadratic(self) -> Quadratic | None:  # type: ignore[override]
-        """The quadratic that it declares to be, without squared numbers in between; None where it is something else."""
+        """The penalty as a quadratic form, in its square root; None where it is not quadratic."""
         penalty, keep, centre, rows, values, groups = self.arguments
         if penalty not in (None, SQUARES) or (penalty is None and not rows):
             return None

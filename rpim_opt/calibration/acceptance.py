@@ -350,7 +350,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     held_out, missed, unheld = _held_out(result, region, requirement, data)
     lacking = [*_unmodelled(result, region), *unheld]
     if result.contradiction:
-        lacking.append("Missing: constraints that agree with the data; the bound depends on them.")
+        lacking.append("Missing: constraints that agree with the data; U depends on them.")
     undecided = () if result.mapping is None else result.mapping.ambiguities
     lacking += [reason for reason in result.verdict.reasons if reason in undecided]
     against = [reason for reason in result.verdict.reasons if reason not in undecided]
@@ -358,7 +358,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     try:
         mapped = workspace(result, requirement, region, drawn)
     except InputError as error:
-        reasons = (*against, *lacking, f"No bound. {result.no_intervals or error}")
+        reasons = (*against, *lacking, f"U is undefined. {result.no_intervals or error}")
         word: Conclusion = "rejected" if against else "inconclusive"
         return Acceptance(requirement, word, reasons, held_out=held_out, caution=caution)
     repeatability, least = repeatability_bounds(result, region, mapped.q[-1], requirement.confidence)
@@ -391,22 +391,22 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
         )
     if any(map(of_session, result.problem.parameters.free.names)) and not result.problem.session:
         return (
-            "Missing: one registration for all sessions, to the same reference points. The bound of "
-            f"{1e3 * bound:.3f} mm includes session offsets, which more configurations do not reduce."
+            "Missing: one registration for all sessions, to the same reference points. U, at most "
+            f"{1e3 * bound:.3f} mm, includes session offsets, which more configurations do not reduce."
         )
     kinds = {b.measurement.name: b.measurement for part in result.problem.rows() for b in part.data.blocks}
     if not any(kind.registers for kind in kinds.values()):
         return (
             f"Missing: the base frame, which {joined(list(kinds))} readings do not determine: more of them hardly "
-            f"reduce the bound of {1e3 * bound:.3f} mm. Survey the base or the anchor, and state the result in [prior] "
+            f"reduce U, at most {1e3 * bound:.3f} mm. Survey the base or the anchor, and state the result in [prior] "
             '(known = ["anchor_x = 900 +- 0.05 mm", ...]).'
         )
     measured = reached_positions(result, found.region, _measured(result), found.requirement.confidence)[1].max()
     apart = ""
     if measured < bound / 2:
-        apart = f", at measured configurations {1e3 * measured:.3f} mm (--measured asks for these, --box for a part)"
+        apart = f", at measured configurations {1e3 * measured:.3f} mm (--measured tests these alone, --box a part)"
     return (
-        f"Missing: more measurements. The bound is {1e3 * bound:.3f} mm{apart}; with all parameters known the robot's "
+        f"Missing: more measurements. U is at most {1e3 * bound:.3f} mm{apart}; with all parameters known the robot's "
         f"repeatability would still contribute {1e3 * repeatability:.3f} mm. `rpim-opt design --augment` names the "
         "configurations that help most."
     )

@@ -1,4 +1,4 @@
-"""Optimality certificate of a solution: functions are called and the model is linearized anew (not that of blocks)."""
+"""Optimality certificate of a solution, from new calls of its functions and, except in blocks, a new linearization."""
 
 from __future__ import annotations
 

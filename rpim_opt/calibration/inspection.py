@@ -1,4 +1,4 @@
-"""Input check before calibration: ranges, coverage, what a quick fit says of the data, identifiability."""
+"""Input check before calibration: ranges, coverage, verdict on a quick fit, identifiability."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Inspection(Tabled):
 
     @property
     def judgement(self) -> tuple[str, ...]:
-        """What speaks against the data by the quick fit, as `calibrate` says it and in its order."""
+        """Reasons and likely causes of the quick fit against the data, as sentences in the order of `calibrate`."""
         if self.fit is None:
             return ()
         verdict = self.fit.verdict
@@ -237,4 +237,4 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
         for i, k in enumerate(first[which.ravel()]):  # a column in NumPy 2.0
             if not np.allclose(block.q[i], block.q[k]):
                 both = f"rows {label[k]} and {label[i]}"
-                yield f"{both} have the same measured values in different configurations: copied?"
+                yield f"{both} have the same measured values in different configurations: were they copied?"

@@ -324,7 +324,7 @@ class Loop:
         return replace(state.weighted(choice), outcome="")
 
     def answered(self, state: State) -> State:
-        """Apply a rule that was not applied yet."""
+        """Apply the rule if it was never applied."""
         if state.choice.final or state.choice.weights:
             return state
         return state.weighted(replace(state.choice, settled=False).updated(self._judged(state)))

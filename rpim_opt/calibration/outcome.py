@@ -148,7 +148,7 @@ class Outcome:
 
     @property
     def robot(self) -> Robot:
-        """The robot with its identified MDH parameters, without gear errors and compliances.
+        """The robot with its identified MDH parameters, without model extensions.
 
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
@@ -372,9 +372,9 @@ class Outcome:
 
     @cached_property
     def spread(self) -> Spread:
-        """The basis of the uncertainty: the equations that the fit keeps, and its penalty.
+        """Covariance of the fit, from the equations that it keeps and its penalty.
 
-        InputError for a penalty that is no squared norm, or a loss that no squared one stands for.
+        InputError for a penalty that is not quadratic, or a loss without a quadratic model.
         """
         if not self.program.linear_penalty:
             raise self.no_covariance("`forward` and monte_carlo work with any")

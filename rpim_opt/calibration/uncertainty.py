@@ -251,12 +251,12 @@ def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None =
 
 
 def unregistered(result: Outcome, data: Dataset, held: HeldOut) -> str:
-    """Say of which sessions the registration is unknown and rows have no interval; empty without such."""
+    """Return a sentence on the sessions whose registration is unknown, so that rows have no interval; empty without."""
     if result.no_intervals or not any(map(of_session, result.problem.parameters.free.names)):
         return ""
     sessions = {*data.session[np.isnan(held.sigmas)]} - {*result.problem.sample().data.session}
     named = listed(sorted(f"'{name}'" for name in sessions))
-    return named and f"Where the instrument stood in session {named} is unknown: register its rows (--register)."
+    return named and f"The registration of session {named} is unknown: register its rows (--register)."
 
 
 def required_coverage(rows: int) -> float:

@@ -82,7 +82,7 @@ class Ready:
 
 
 def name_of(function: Any, k: int) -> str:
-    """Return the user's name of a constraint function: of a lambda what it returns, as its file or notebook has it."""
+    """Return the name of a constraint function; of a lambda its source text."""
     name = getattr(function, "name", getattr(function, "__name__", "<lambda>"))
     if name != "<lambda>":
         return str(name)

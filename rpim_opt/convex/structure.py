@@ -116,7 +116,7 @@ class Expressions:
         self.predicts = bool(known.asked)
 
     def owned(self, *stated: Any) -> set[int]:
-        """Return which of the functions' own variables some expressions and constraints have."""
+        """Return the ids of the functions' own variables in some expressions and constraints."""
         return self.own & {v.id for each in stated if each is not None for v in each.variables()}
 
 

@@ -70,18 +70,18 @@ class Feature:
 
     @property
     def level(self) -> Feature:
-        """The point or plane with its touches on it, and parallel planes made parallel: nominal errors are no noise."""
+        """The feature with all touches on it, and parallel to planes that should be: nominal errors are no noise."""
         return replace(self, height=np.zeros_like(self.height), axis=None)
 
     @cached_property
     def aside(self) -> Array:
-        """The orthonormal basis (K, k) of contrasts."""
+        """Orthonormal basis (K, k) of the contrasts."""
         if self.planar:
             return np.linalg.qr(self.places, mode="complete")[0][:, 3:]
         return -scipy.linalg.helmert(len(self.places)).T
 
     def kept(self, equations: np.ndarray) -> np.ndarray:
-        """Return the touches' equations, of (K, 3), in whose places contrasts stand, (k, 3 or 1)."""
+        """Return the equations (k, 3 or 1), of the touches' (K, 3), that the contrasts replace."""
         return equations[self.places.shape[1] :, : len(self.shown)]
 
     def seen(self, values: Array) -> Array:
@@ -254,7 +254,7 @@ class Touches:
 
     @cached_property
     def kept(self) -> np.ndarray:
-        """Which equations (m,) remain: all but those of touches, and those in whose places contrasts stand."""
+        """Which equations (m,) remain: all but those of touches, and those that contrasts replace."""
         mask = np.ones(self.equations, dtype=bool)
         for thing, index in zip(self.where, self.rows, strict=True):
             mask[index] = False

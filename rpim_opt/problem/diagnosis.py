@@ -447,7 +447,7 @@ def unrelated_rows(problem: CalibrationProblem, error: float) -> Iterator[str]:
     yield (
         f"joint values hardly explain the measured positions (residual RMS {three_digits(1e3 * error)} mm, spread "
         f"{three_digits(1e3 * spread)} mm, that of the nominal flange {three_digits(1e3 * flange)} mm): do the rows of "
-        "the two tables match? Join them by a common column, or by time. Or are these deviations, or another quantity?"
+        "the two tables match? Join them by a common column, or by time. Or were deviations exported, not positions?"
     )
 
 
@@ -846,7 +846,7 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
     down = {
         "with the direction of gravity at the flange": problem.robot.gravity.direction @ flange[problem.owners, :3, :3]
     }
-    cause = "is it loose in its nest, or its holder soft"
+    cause = "is it loose in its nest, or its holder compliant"
     yield from _changes(whole, there, A, [tool_prefix(m) + c for m in markers for c in "xyz"], "reflector", cause, down)
     for family in (bends, eccentric, bends | eccentric):  # either alone explains more with fewer columns
         lacking = np.isin(free.names, every[family & ~p.identified])
@@ -988,8 +988,8 @@ def _uneven_noise(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     if times > NOISY and freedom.min() > 1 and len(size) * fdtrc(freedom[worst], freedom[second], times**2) < RARE:
         name = columns.pop()[worst]
         yield (
-            f"values of column {name} scatter {three_digits(times)} times as much as those of the others, which they "
-            f"are weighed like: check what measured it, or state its noise (column sigma_{name}_mm, ...)."
+            f"residuals of column {name} are {three_digits(times)} times those of the other columns, with the same "
+            f"stated noise: check what measured it, or state its noise (column sigma_{name}_mm, ...)."
         )
 
 
@@ -1015,9 +1015,9 @@ def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     if size < NOTICED and times > SCATTERED:
         rows = joined([problem.data.label[i] for i in np.flatnonzero(~kept)])  # all, as they are to be left out
         yield (
-            f"rows {rows} scatter {three_digits(times)} times as much as the others, which agree with the stated "
-            "noise: was the reflector loose in its nest, or the arm not at rest? Measure them again, or leave them out "
-            "([exclude])."
+            f"residuals of rows {rows} are {three_digits(times)} times those of the others, which agree with the "
+            "stated noise: was the reflector loose in its nest, or the arm not at rest? Measure them again, or leave them "
+            "out ([exclude])."
         )
 
 
@@ -1157,8 +1157,8 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         yield Addition(circles, lambda c: (said.format(three_digits(1e3 * np.abs(c).max())), of_circles))
         middle = y - np.mean(y, axis=0)
         cubic = np.sum(of_axis * middle * np.sum(middle**2, axis=1, keepdims=True), axis=1)
-        lens = "calibrate its lens or its refraction, or measure nearer to its axis"
-        distorted = "measured positions are distorted with the cube of their distance from their middle"
+        lens = "calibrate the instrument's lens or refraction, or measure nearer to its axis"
+        distorted = "measured positions are distorted with the cube of their distance from the mean"
         yield Addition(cubic[:, None], lambda c: (distorted, lens))
     for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
         what = (f"column {'xyz'[i]} is", "check its scale")

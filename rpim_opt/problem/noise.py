@@ -114,7 +114,7 @@ class Equations(NamedTuple):
         return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
     def stack(self, index: np.ndarray, slopes: Array | None = None, shifts: Array | None = None) -> Stack:
-        """Return what divides noise of equations (N, k); slopes (m, dof) by joints, (m, 3) by where a robot is."""
+        """Return the noise of equations (N, k), from their slopes (m, dof) by joints, and (m, 3) by a robot's place."""
         row = self.row[index]
         V = self.covariance[index[:, :, None], self.component[index][:, None, :]]
         V = V * (row[:, :, None] == row[:, None, :])

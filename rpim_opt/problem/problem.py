@@ -115,7 +115,7 @@ class RobotModel(Tabled):
 
         ``identify`` are patterns of the terms' parameters that are identified besides what is; all of them by default.
         What reads blocks has to read the columns that terms see. InputError for a name that the problem has, a pattern
-        that matches none of the new ones, and data without a column that an identified term sees.
+        that matches none of the new ones, and data without a column that an identified term needs.
 
         >>> import rpim_opt as ro
         >>> wave = ro.robot.Term(lambda joint, size: size * joint.q**2, {"bow_mrad": 0.1})
@@ -498,7 +498,7 @@ class CalibrationProblem(RobotModel):
         return [(stack.index, _inverse_root(stack.covariance(repeatability))) for stack in stacks]
 
     def stacks(self, joints: bool = True, at: Array | None = None) -> list[Stack]:
-        """Return the equations by configuration, with what divides their noise.
+        """Return the equations by configuration, with the components of their noise.
 
         ``joints``: whether the slopes by the joints' angles are wanted; ``at``: (P,) values of all parameters at which
         they are taken [SI], None for nominal.
@@ -510,7 +510,7 @@ class CalibrationProblem(RobotModel):
         return contrasted(self.touches, stacks, stop[self._equations.row])
 
     def _stacked(self, groups: Iterable[np.ndarray], joints: bool, at: Array | None) -> list[Stack]:
-        """Return groups of equations (N, k) with what divides their noise; arguments as for `stacks`."""
+        """Return groups of equations (N, k) with the components of their noise; arguments as for `stacks`."""
         slopes = self.joint_slopes(at) if joints else None
         shifts = None
         seen = [block.measurement.metres is not None for block in self.data.blocks]

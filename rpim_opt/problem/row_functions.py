@@ -186,7 +186,7 @@ class Loads(NamedTuple):
     def configuration(
         self, joint_types: Sequence[str], nominal: Callable[[str], Symbol], stated: RowSymbols, point: int = 0
     ) -> Configuration:
-        """Return what the joints of an arm of nominal parameters see at a point of a row, from the row's symbols."""
+        """Return the state of an arm of nominal parameters at a point of a row, from the row's symbols."""
         dof = len(joint_types)
         at = slice(point * dof, (point + 1) * dof)
         parts = {name: ca.vertsplit(stated[name][at]) for name in PER_JOINT if name in stated}

@@ -153,7 +153,7 @@ def delivered(result: Calibration) -> str:
     if not result.verdict.delivered:
         return ""
     if result.verdict.caution:
-        return "Delivered under a condition: check what is said below before using this robot."
+        return "Delivered under a condition: check the condition below before using this robot."
     return "Delivered: the fit gives no reason against using this robot; no acceptance limit is stated."
 
 

@@ -156,8 +156,8 @@ def require_same_arm(robot: Robot, original: Robot, file: Path) -> list[str]:
         raise InputError(f"robot ({robot.source or robot.name})", found, accepted, file)
     if zeros:
         notes.append(
-            f"{file.name}: zeros moved against the original, in the joints' origins: {joined(zeros)}. Joint values "
-            "need no correction for them; limits and named poses count from the new zeros."
+            f"{file.name}: joint zeros differ from the original's, within the joints' origins: {joined(zeros)}. Joint "
+            "values need no correction for them; limits and named poses refer to the new zeros."
         )
     return notes
 
@@ -178,7 +178,7 @@ def joint_values(robot: Robot, original: Robot, file: Path) -> list[str]:
         places.append(f"joint {original.joint(i)} is at {' '.join(terms)}")
     if not places:
         return []
-    return [f"{file.name}: with the calibration's joint values q its {joined(places)}; the file lacks this mapping."]
+    return [f"{file.name}: with the calibration's joint values q its {joined(places)}; the file cannot state this."]
 
 
 def without_beta(robot: Robot) -> Robot:

@@ -357,7 +357,7 @@ class Model:
 
     @cached_property
     def columns(self) -> Mapping[str, str]:
-        """Further columns of the data that its terms see, name to dimension."""
+        """Further columns of the data that its terms depend on, name to dimension."""
         return {name: dimension for term in self.terms for name, dimension in term.columns.items()}
 
     @property

@@ -116,7 +116,7 @@ class Compensation:
                 shown = (values.mean(), np.sqrt(np.mean(values**2)), values.max())
                 figures.append([name, *(f"{1e3 * value:.4f}" for value in shown)])
         changes = (f"{name.replace('_', f' {value:.3f} ')}" for name, value in self._largest_corrections().items())
-        moved = f" (a common motion of all targets, or another base, leaves {1e3 * self.after_motion:.4f} mm RMS)"
+        moved = f" (after a common displacement of all targets {1e3 * self.after_motion:.4f} mm RMS)"
         flange = 1e3 * forward_kinematics(self.robot, np.zeros((1, self.robot.dof)))[0, :3, 3]
         lines = [
             table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
@@ -129,8 +129,8 @@ class Compensation:
         if self.std_after_motion < rms(self.std) / 2:
             whole, left = (f"{1e3 * EXPANDED * each:.4f} mm" for each in (rms(self.std), self.std_after_motion))
             lines.append(
-                f"Of the expanded uncertainty (k = 2), {whole} RMS, a common motion of all targets makes the most: the "
-                f"calibration hardly determines where the robot's base is. Relative to each other it is {left} RMS."
+                f"Most of the expanded uncertainty (k = 2), {whole} RMS, is a common displacement of all targets: the "
+                f"data hardly determine the base frame. Relative to each other the targets have {left} RMS."
             )
         at_fault = {UNREACHABLE: " in the robot's base frame", ABOVE: f" of {1e3 * self.limit:g} mm"}
         for status, where in {"limited": "", "near singular": "", **at_fault}.items():
@@ -514,7 +514,7 @@ class _Cell(NamedTuple):
         )  # fmt: skip
 
     def begun(self, targets: Targets) -> _Begun:
-        """Return the commands for some targets, which the controller's robot reaches by them where it can."""
+        """Return the nominal commands for some targets, and the errors of both robots there."""
         _, q, poses, torque, payload = targets
         N = len(targets.label)
         borne = [] if torque is None else [torque @ np.linalg.inv(self.robot.joint_map)]

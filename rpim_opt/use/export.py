@@ -43,7 +43,7 @@ from rpim_opt.use.sessions import base_frame, in_session, session_notes
 
 OF_BYTES = "surrogateescape"  # files of other tools keep their encoding
 ANOTHER_MODEL = 0.01  # lengths of a robot that are off its model's by more [m] are another model's, d1 another base's
-FLANGE = "the flange frame (after the last joint; alpha and a in the last row of a DH sheet come behind it)"
+FLANGE = "the flange frame (after the last joint; alpha and a in the last row of a DH sheet follow it)"
 CONVENTION = {  # what is said of a table in a convention
     "modified": "modified DH (Craig), Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta). For the "
     "standard convention (Paul) write a .csv with --dh standard",
@@ -53,7 +53,7 @@ CONVENTION = {  # what is said of a table in a convention
 
 
 class Exported(NamedTuple):
-    """Files, sentences on what they do not hold, and whether what is written is inconclusive."""
+    """Files, sentences on what they do not hold, and whether the verdict on them is inconclusive."""
 
     files: list[Path]
     notes: list[str]
@@ -154,7 +154,7 @@ def export_files(
     of_geometry += [*lost, *session_notes(result, robot)]
     others = (urdf, ur_kinematics, ur_calibration, camera_info, mdh, robodk)
     if corrections and any(others) and not transmission_errors(whole):
-        without = f"Not written: {Path(corrections).name}, since the calibration has no curves of transmission errors."
+        without = f"Not written: {Path(corrections).name}, since the calibration has no transmission errors."
         remarks, corrections = [without, *remarks], None
     corrected: list[tuple[str | Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, partial(_write_urdf, result, marker, robot, **frames)),
@@ -215,7 +215,7 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
         undecided = True
         of_geometry += f" It is above the limit of {1e3 * required.limit:g} mm"
         of_geometry += "; only the whole model's is within it." if accepted.verdict == "accepted" else "."
-    remarks.append("Other points and the flange's orientation may be less certain: `compensate --tool` says how much.")
+    remarks.append("Other points and the flange's orientation may be less certain: `compensate --tool` states their U.")
     return note, [of_geometry], remarks, undecided
 
 

@@ -111,7 +111,7 @@ class Monitoring:
         count = f"{len(self.label)} checks"
         lines = [f"No drift in {count}."]
         if self.drifts:
-            lines = [f"The robot deviates from its calibration ({count} read).", *filter(None, [self.mistake])]
+            lines = [f"The robot deviates from its calibration ({count}).", *filter(None, [self.mistake])]
         if self.beyond:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
             lines.append(f"Outside the prediction interval of a new reading: {listed(named, between='; ')}.")
@@ -130,7 +130,7 @@ class Monitoring:
             if self.drift.others:
                 lines.append(f"A change of {joined(self.drift.others)} explains the checks as well: measure more.")
         elif self.drifts:
-            lines.append("No single parameter or frame explains it.")
+            lines.append("No single parameter or frame explains the deviation.")
         worst = int(np.argmax(self.sigmas / self.allowed))
         lines.append(
             f"Largest residual: {self._named(worst)}, {self.sigmas[worst]:.1f} standard deviations of a new reading "

@@ -49,7 +49,7 @@ def read_targets(
     tool: Sequence[float] | Array | None = None,
     marker: str = "",
 ) -> tuple[Targets, Understanding]:
-    """Return the targets of a table, whose columns are recognized by name, and what was understood of it.
+    """Return the targets of a table, whose columns are recognized by name, and their interpretation.
 
     Columns are joint values (``q1_deg``, ...), positions in the robot's base (``x_mm, y_mm, z_mm``), with
     ``qw, qx, qy, qz``, ``rx_deg, ry_deg, rz_deg`` or ``r11`` to ``r33`` poses, or both: joint values are then where to

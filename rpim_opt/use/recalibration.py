@@ -196,8 +196,8 @@ class Update:
         if self.undetermined:
             lines.append(
                 f"The new rows do not determine the pose of {joined(self.undetermined)}: measure at least three "
-                "configurations with the reflector's positions not on a line, or update without --reset where all "
-                "stands as before."
+                "configurations with the reflector's positions not on a line, or update without --reset if nothing "
+                "was moved."
             )
         for name, of in self.errors.items():
             was, now = (f"{of[when]['rms_mm']:.4f} mm" for when in ("before", "after"))
@@ -546,7 +546,7 @@ class Misfit:
         self.fit = Fit(squares, freedom, self._p_value(squares, freedom))
 
     def projected(self, rows: slice | np.ndarray, values: Array) -> tuple[Array, Array]:
-        """Return g (p,) and G (p, p) of a change whose D has these values in some rows, and zeros in the others."""
+        """Return g (p,) and G (p, p) of a change, from the ``values`` of D in some rows and zeros in the others."""
         D = np.zeros((len(self.e), values.shape[1]))
         D[rows] = values
         along = self.Q.T @ D
@@ -612,7 +612,7 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
 
 
 def log_priors(causes: Sequence[Cause]) -> Array:
-    """Return ln of the probabilities of causes (C,) before any reading: kinds are as likely, and causes of a kind."""
+    """Return ln of the prior probabilities of causes (C,): equal for all kinds, and for all causes of a kind."""
     kinds = [cause.kind for cause in causes]
     share = (1 - UNCHANGED) / len(set(kinds))
     return np.log([share / kinds.count(kind) for kind in kinds])

@@ -60,7 +60,7 @@ class Validation(HeldOut):
 
     @property
     def uncovered(self) -> bool:
-        """Whether fewer coordinates are inside their prediction intervals than chance lets be."""
+        """Whether fewer coordinates are inside their prediction intervals than chance explains."""
         return self.coverage is not None and self.coverage < required_coverage(len(self.label))
 
     @property

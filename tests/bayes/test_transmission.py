@@ -203,7 +203,7 @@ def test_corrections_are_a_table(rippled, tmp_path):
         ro.use.export_files(plain, corrections=tmp_path / "none.csv")
     written, said, _ = ro.use.export_files(plain, mdh=tmp_path / "arm.csv", corrections=tmp_path / "none.csv")
     assert [file.name for file in written] == ["arm.csv"]
-    assert said[0] == "Not written: none.csv, since the calibration has no curves of transmission errors."
+    assert said[0] == "Not written: none.csv, since the calibration has no transmission errors."
     assert not (tmp_path / "none.csv").exists()
 
 

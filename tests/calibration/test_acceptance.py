@@ -166,7 +166,7 @@ def test_joints_that_were_moved_together_do_not_bound_other_combinations() -> No
     found = ro.calibration.accept(moved_together, ro.data.Requirement(1e-4))
     assert found.verdict == "inconclusive"
     measured = reached_positions(moved_together, region_of(moved_together, found.requirement), q, 0.95)[1].max()
-    assert f", at measured configurations {1e3 * measured:.3f} mm (--measured asks for these" in str(found)
+    assert f", at measured configurations {1e3 * measured:.3f} mm (--measured tests these alone" in str(found)
     assert found.bound is not None
     assert found.bound > 2 * measured
 
@@ -294,7 +294,7 @@ def test_a_penalty_without_covariance_has_no_bound(instance) -> None:
     found = accept(ro.calibrate(instance.problem, ro.lasso, 1.0), Requirement(1e-3), instance.validation)
     assert found.verdict == "inconclusive"
     assert found.bound is None
-    assert any("No bound" in reason for reason in found.reasons)
+    assert any("U is undefined" in reason for reason in found.reasons)
 
 
 @pytest.mark.parametrize("loss", [ro.tikhonov.loss, lambda v: cp.sum(cp.huber(v, 2))], ids=["squares", "Huber"])

@@ -361,7 +361,7 @@ def loose_reflector(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
     [
         (
             values(lambda y: y + 1e-3 * np.random.default_rng(8).normal(size=y.shape) * [0, 1, 0]),
-            r"column y scatter \d",
+            r"residuals of column y are \d",
         ),
         (loose_reflector, "gravity at the flange the points move to and fro, consistent with a changed reflector"),
         (values(lambda y: np.hstack([(2e3 * y[:, :1]).round() / 2e3, y[:, 1:]])), r"are rounded to 0.5 mm \(x\)"),
@@ -699,7 +699,7 @@ def test_rows_in_which_the_reflector_was_loose_are_named() -> None:
     slip = 1e-3 * rng.uniform(0.5, 2, COUNT) * slipped
     wrong = values(lambda y: y + slip[:, None] * Rotation.random(COUNT, random_state=2).as_matrix()[..., 2])
     result = ro.calibrate(wrong(simulated_arm("ur5e")))
-    named = re.search(r"Likely: rows (.*) scatter [\d.]+ times as much as the others", str(result.verdict))
+    named = re.search(r"Likely: residuals of rows (.*) are [\d.]+ times those of the others", str(result.verdict))
     assert named, result.verdict
     assert result.learned
     left_out = {row.label for row in result.learned.left_out}  # of which there were too many
@@ -871,7 +871,7 @@ def test_columns_that_few_rows_fit_exactly_do_not_tell_the_noise_of_another() ->
     gross = np.zeros((10, 3))
     gross[:3] = 0.01 * np.random.default_rng(3).normal(size=(3, 3))
     result = ro.calibrate(values(lambda y: y + gross)(simulated_arm("ur5", 3, 10)))
-    assert "scatter" not in str(result.verdict)
+    assert "residuals of column" not in str(result.verdict)
 
 
 def test_misread_orientations_are_named() -> None:

@@ -323,7 +323,7 @@ def test_outliers_that_bias_a_loss_of_ones_own_are_named_and_not_the_formulation
     steep = ro.Formulation("steep", lambda v: cp.sum(v**4), cp.sum_squares)
     for formulation in ("minimax", steep):
         (reason,) = ro.calibrate(ro.load("blunders").problem, formulation, 1.0).verdict.reasons
-        assert "rows c1, c7, c14, c39 and c43 scatter" in reason
+        assert "residuals of rows c1, c7, c14, c39 and c43 are" in reason
 
 
 def test_outliers_are_the_cause_where_the_same_rows_without_them_fit_a_loss_of_ones_own() -> None:

@@ -138,7 +138,7 @@ def test_parameters_state_their_flange_frame_and_units_as_they_are_written() -> 
     assert np.allclose([row["deviation"] for row in rows], 1e3 * result.x[bends])
     assert f"{rows[0]['parameter']} [mrad]" in words
     assert "mrad_per_Nm" not in words
-    assert words.count("alpha and a in the last row of a DH sheet come behind it") == 1
+    assert words.count("alpha and a in the last row of a DH sheet follow it") == 1
 
 
 def test_one_file_that_loads_nothing(arm_page) -> None:

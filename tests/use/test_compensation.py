@@ -170,7 +170,7 @@ def test_what_is_one_motion_of_all_targets_is_said() -> None:
     found = ro.use.compensate(turned, q, despite_verdict=True)
     assert rms(found.position_before) > 1e-4
     assert found.after_motion == pytest.approx(0, abs=1e-9)
-    assert "a common motion of all targets, or another base, leaves 0.0000 mm RMS" in str(found)
+    assert "after a common displacement of all targets 0.0000 mm RMS" in str(found)
 
 
 def test_the_limit_of_a_result_holds_for_its_commands() -> None:
@@ -649,7 +649,7 @@ def test_a_common_motion_of_all_targets_is_told_from_what_is_uncertain_beside_it
     std = np.sqrt(np.mean(found.std**2))
     assert found.std_after_motion < std / 20
     text = f"Relative to each other it is {2e3 * found.std_after_motion:.4f} mm RMS."
-    assert f"{2e3 * std:.4f} mm RMS, a common motion of all targets makes the most" in str(found)
+    assert f"{2e3 * std:.4f} mm RMS, is a common displacement of all targets" in str(found)
     assert text in str(found)
     assert "Relative to each other" not in str(ro.use.compensate(calibrated()[0], commands(ARM, 30)))
 

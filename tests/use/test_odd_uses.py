@@ -96,7 +96,7 @@ def test_an_update_says_what_came_out() -> None:
 @pytest.mark.parametrize(
     ("drift", "said"),
     [
-        (None, "No single parameter or frame explains it."),
+        (None, "No single parameter or frame explains the deviation."),
         (Drift(JOINT, 0, True, MOVED), "theta2 +0.0573 deg (standard deviation 0.0057), steadily from"),
         (Drift(JOINT, 0, False, MOVED), "before the first check"),
         (Drift(JOINT, 3, False, None), "theta2, in one step before '4'"),
@@ -108,7 +108,7 @@ def test_monitoring_says_what_moved(drift: Drift | None, said: str) -> None:
     sums = np.array([0.0, 0.0, 1.0, 2.0, 9e9, 9e9, 9e9, 9e9])
     found = replace(quiet, sums=sums, drift=drift)
     lines = str(found).splitlines()
-    assert lines[0] == "The robot deviates from its calibration (8 checks read)."
+    assert lines[0] == "The robot deviates from its calibration (8 checks)."
     assert lines[1] == "Cumulative sum above its limit at check '5', rising since '3'."
     assert said in lines[2]
     assert found.content()["since"] == "3"

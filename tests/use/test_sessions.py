@@ -165,7 +165,7 @@ def test_a_third_place_is_no_change_of_the_robot_and_says_nothing_of_it_before_i
     data = ro.Dataset.of(arm.read.q[:20], y, NOISE, session=["third"] * 20)
     found = ro.use.validate(result, data)
     assert found.coverage is None
-    assert "Where the instrument stood in session 'third' is unknown" in str(found)
+    assert "The registration of session 'third' is unknown" in str(found)
     assert ro.use.monitor(result, data).mistake == found.no_intervals
     judged = replace(result, record=replace(result.record, validation=data)).verdict
     assert f"Held-out rows do not fit. {found.no_intervals}" in judged.reasons

@@ -209,7 +209,7 @@ class Canonical:
         return changed
 
     def missed(self, x: Array) -> float:
-        """Return the violation of equations, inequalities and second-order cones at x (N,), as they were stated."""
+        """Return the violation of the stated equations, inequalities and second-order cones at x (N,)."""
         slack = np.divide(self.b - self.A @ x, self.row_scale, out=np.zeros(len(self.b)), where=self.row_scale > 0)
         worst = [np.abs(slack[: self.zero]).max(initial=0.0), -slack[self.zero : self.linear].min(initial=0.0)]
         for part in self.cone_rows[: self.second_order]:

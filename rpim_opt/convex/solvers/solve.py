@@ -61,7 +61,7 @@ class WarmStart:
         return self.small[key]
 
     def begin(self, z: Array) -> WarmStart:
-        """Look for the next minimum from z (n,) on, with solvers set up anew."""
+        """Discard all solvers, and start the next solution from z (n,)."""
         with self.lock:
             self.z = self.x = z if len(self.canonical.at) == self.canonical.size else None
             self.width, self.count, self.part, self.small = 0.0, 0, None, {}

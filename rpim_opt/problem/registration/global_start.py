@@ -357,7 +357,7 @@ class _Mappings:
 
     @cached_property
     def zeros(self) -> list[Array]:
-        """Zeros (dof,) that base and tool do not take up."""
+        """Zeros (dof,) without what base and tool absorb."""
         return [_gauged(self.points.robot, zero) for zero in self.fits.zero]
 
     @cached_property
@@ -366,7 +366,7 @@ class _Mappings:
         return np.linalg.norm(self.fits.tools - Candidates.of([self.points]).stated, axis=-1).max(axis=-1)
 
     def plain(self, i: int) -> tuple[int, int, int, float, tuple[float, ...]]:
-        """How far one is from that stated: joints that change, reflectors, reversed joints, zeros, then signs."""
+        """Sort key for the least change: number of changed joints, reflector, reversed joints, zeros, then signs."""
         reverse, zero = self.sign[i] < 0, np.abs(self.zeros[i])
         changed = int((reverse | (zero > NEAR_ZERO)).sum())
         size = round(float(zero.sum()), 2)
@@ -379,7 +379,7 @@ class _Mappings:
         return there - there.mean(axis=(0, 1)) if self.points.lengths else there
 
     def robots(self, there: Mapping[int, Array], same: float) -> list[list[int]]:
-        """Return mappings by the robot that they describe, the best first.
+        """Return the indices of the mappings, grouped by the robot that they describe, the best first.
 
         Two are one robot that predict the same, to ``same`` [m], or of which a plainer one has the signs and nearly the
         zeros of the other; so are those that a third one connects.
