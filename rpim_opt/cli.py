@@ -156,7 +156,7 @@ Code = Annotated[bool, Option("--allow-code", help="Allow running the folder's P
 # --- how a command is made ---------------------------------------------------------------------------------
 
 
-class Answer(NamedTuple):
+class Output(NamedTuple):
     """Output of a command: text and document, exit code, files written, and notes on reading its tables."""
 
     text: object
@@ -210,7 +210,7 @@ PASSED = ("tables", "as_json")  # parameters of commands that are no options by 
 CODELESS = ("new", "iso9283", "study", "robots")  # commands that read no folder of a calibration, which may name code
 
 
-def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
+def command(function: Callable[..., Output]) -> Callable[..., Output]:
     """Add a command: its output is printed, as text or with --json as a document, and decides the exit code.
 
     A parameter ``tables`` stands for the options of `Tables`, ``as_json`` for --json; a command that runs a folder's
@@ -260,7 +260,7 @@ def new(
     dh: Annotated[str, Option(help="Convention of a DH table: modified (Craig) or standard (Paul, Hayati).")] = "",
     target: Annotated[str, Option(help="Board of a camera: a table with point, x_mm, y_mm, or 7x5,30mm.")] = "",
     as_json: bool = False,
-) -> Answer:
+) -> Output:
     """Make a problem folder from a table and a robot, with comments on all keys and reasons for all guesses."""
     with console.progress():
         made = ro.store.new_problem(
@@ -270,11 +270,11 @@ def new(
         )  # fmt: skip
     document = made.understood.content()
     document["notes"] += made.notes
-    return Answer(made, {"written": [] if dry_run else [made.folder], **document})
+    return Output(made, {"written": [] if dry_run else [made.folder], **document})
 
 
 @command
-def inspect(problem: Problem, variant: Variant = None) -> Answer:
+def inspect(problem: Problem, variant: Variant = None) -> Output:
     """Check the input before calibrating: joint ranges, repeated rows, likely causes of errors, identifiability.
 
     Exit code 1 if the robot of a quick fit would not be delivered.
@@ -297,7 +297,7 @@ def inspect(problem: Problem, variant: Variant = None) -> Answer:
     if together is not None:
         text += f"\n\nAll robots together: {together}"
     refused = any(part.fit is not None and not part.fit.verdict.delivered for part in parts.values())
-    return Answer(text, document, int(refused))
+    return Output(text, document, int(refused))
 
 
 @command
@@ -314,7 +314,7 @@ def calibrate(
     box: Box = None,
     measured: Measured = None,
     out: Folder = None,
-) -> Answer:
+) -> Output:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
     Exit code 1 if the robot is not delivered or the acceptance test rejects it; 4 if that is inconclusive: the test,
@@ -350,7 +350,7 @@ def calibrate(
         rows = f"Refitted without {', '.join(without)}" if without else "No flagged row to drop: nothing was refitted"
         text = f"{rows}.\n\n{text}"
     code = CODES[document["conclusion"]] if result.verdict.delivered else 1
-    return Answer(text, {**document, "refitted_without": without}, code, _saved(result, out))
+    return Output(text, {**document, "refitted_without": without}, code, _saved(result, out))
 
 
 @command
@@ -361,7 +361,7 @@ def report(
     tables: Tables = TABLES,
     measurement: Kind = None,
     register: Register = False,
-) -> Answer:
+) -> Output:
     """Write the calibration report: one self-contained HTML page, ready to be signed.
 
     With --data it has a section of their validation, with the acceptance test by them where the result has a limit
@@ -379,7 +379,7 @@ def report(
             folder = result if result.is_dir() else result.parent
             out = inside(folder, "report.html", "the file", folder)
         ro.report.write_report(loaded, out, new=new)
-    return Answer("", {}, written=[out], read=read)
+    return Output("", {}, written=[out], read=read)
 
 
 @command
@@ -391,7 +391,7 @@ def validate(
     limit: Annotated[Number, Option(help=PERMITTED)] = None,
     register: Register = False,
     out: Table = None,
-) -> Answer:
+) -> Output:
     """Validate a result on new measurements, and list rows outside their prediction intervals.
 
     In the table of --out, sigmas is a row's error over its predicted standard deviation; the largest of all rows
@@ -414,7 +414,7 @@ def validate(
     if within and not code and validation.uncovered:
         code = CODES["inconclusive"]
     written = console.written_to(out, validation.csv())
-    return Answer("\n".join([str(validation), *text]), document, code, written, read)
+    return Output("\n".join([str(validation), *text]), document, code, written, read)
 
 
 @command
@@ -427,7 +427,7 @@ def accept(
     tables: Tables = TABLES,
     measurement: Kind = None,
     register: Register = False,
-) -> Answer:
+) -> Output:
     """Test the calibrated robot against a tolerance, by its expanded uncertainty over a region.
 
     Exit code 0 if it is accepted, 1 if it is rejected, 4 if inconclusive, with what is missing.
@@ -442,7 +442,7 @@ def accept(
         acceptance = ro.calibration.accept(placed, requirement, read and read.data)
     text = "\n".join([str(acceptance), *ro.use.session_notes(placed)])
     document = {**acceptance.content(), "session": placed.problem.session or None}
-    return Answer(text, document, CODES[acceptance.verdict], read=read)
+    return Output(text, document, CODES[acceptance.verdict], read=read)
 
 
 @command
@@ -452,7 +452,7 @@ def iso9283(
     limit: Annotated[Number, Option(help="Largest permitted pose accuracy AP_p [mm]; exit code 1 if exceeded.")] = None,
     repeatability: Annotated[Number, Option(help="Largest permitted RP_l [mm]; exit code 1 if exceeded.")] = None,
     out: Table = None,
-) -> Answer:
+) -> Output:
     """Compute pose accuracy AP and repeatability RP from repeated approaches, as ISO 9283 defines them."""
     console.require_positive("--limit", limit)
     console.require_positive("--repeatability", repeatability)
@@ -465,7 +465,7 @@ def iso9283(
     limits = {"limit_mm": limit, "repeatability_limit_mm": repeatability}
     document = {**performance.content(), **limits, "within_limits": all(checked) if checked else None}
     written = console.written_to(out, performance.csv())
-    return Answer("\n".join([str(performance), *accuracy, *repeated]), document, int(not all(checked)), written)
+    return Output("\n".join([str(performance), *accuracy, *repeated]), document, int(not all(checked)), written)
 
 
 @command
@@ -478,7 +478,7 @@ def update(
     reset: Annotated[str, Option(help="Parameters without a prior: 'base_*' after the instrument was moved.")] = "",
     source: Source = None,
     out: Folder = None,
-) -> Answer:
+) -> Output:
     """Recalibrate with the previous result as prior, and report which parameters changed.
 
     Exit code 1 if errors on the new measurements stay unexplained, or the robot is not delivered.
@@ -493,7 +493,7 @@ def update(
         updated = recalibration.result
         updated = replace(updated, record=replace(updated.record, files={file.name: sha256_of(file) for file in data}))
     failed = not (recalibration.explained and updated.verdict.delivered)
-    return Answer(recalibration, recalibration.content(), int(failed), _saved(updated, out), read)
+    return Output(recalibration, recalibration.content(), int(failed), _saved(updated, out), read)
 
 
 @command
@@ -504,7 +504,7 @@ def monitor(
     measurement: Kind = None,
     register: Register = False,
     out: Annotated[File, Option(help="Control chart over time as .html, or its points as .csv.")] = None,
-) -> Answer:
+) -> Output:
     """Detect drift in check readings over time, by their prediction intervals and a CUSUM chart.
 
     Exit code 1 if the robot drifts.
@@ -515,7 +515,7 @@ def monitor(
         if out is not None:
             ro.report.write_checks(monitoring, out, loaded.record.title)
     written = [] if out is None else [out]
-    return Answer(monitoring, monitoring.content(), int(monitoring.drifts), written, read)
+    return Output(monitoring, monitoring.content(), int(monitoring.drifts), written, read)
 
 
 @command
@@ -538,7 +538,7 @@ def export(
     marker: Marker = None,
     robot: Annotated[str, Option(help="Robot to export, of several in one calibration.")] = "",
     despite_verdict: Despite = False,
-) -> Answer:
+) -> Output:
     """Export the identified robot to files of other tools: all of them are written, or none.
 
     Exit code 1 if the robot is not delivered, or rejected by its acceptance test, and nothing is written; 4 if
@@ -551,7 +551,7 @@ def export(
             tip_measured=tip_measured, marker=marker, robot=robot, despite_verdict=despite_verdict,
         )  # fmt: skip
     code = CODES["inconclusive" if exported.inconclusive else "accepted"]
-    return Answer("\n".join(exported.notes), {"notes": exported.notes}, code, exported.files)
+    return Output("\n".join(exported.notes), {"notes": exported.notes}, code, exported.files)
 
 
 @command
@@ -570,7 +570,7 @@ def compensate(
     limit: Annotated[Number, Option(help=REMAINING)] = None,
     out: Table = None,
     despite_verdict: Despite = False,
-) -> Answer:
+) -> Output:
     """Correct joint commands so that the calibrated robot reaches the poses of the nominal one.
 
     Exit code 1 if the robot is not delivered, or a command misses its target: unreachable, or error and uncertainty
@@ -597,11 +597,11 @@ def simulate(
     problem: Annotated[str, Argument(help="A problem folder with a [simulation] table.")],
     seed: Annotated[int | None, Option(min=0, help="Seed in place of the file's.")] = None,
     out: Annotated[File, Option(help="Folder for the tables; the problem's own by default.")] = None,
-) -> Answer:
+) -> Output:
     """Simulate the tables of a problem, and write its true parameters."""
     from rpim_opt.store.simulation import write_simulation
 
-    return Answer("", {}, written=write_simulation(problem, seed, out))
+    return Output("", {}, written=write_simulation(problem, seed, out))
 
 
 @command
@@ -615,7 +615,7 @@ def design(
     seed: Annotated[int, Option(min=0, help="Seed of the random candidates.")] = 0,
     augment: Annotated[bool, Option("--augment", help="Add to the measured configurations, in their ranges.")] = False,
     out: Table = None,
-) -> Answer:
+) -> Output:
     """Choose the next configurations to measure by optimal design."""
     with console.progress() as say:
         import numpy as np
@@ -658,7 +658,7 @@ def study(
     redraw: Annotated[bool, Option("--redraw", help="Only rewrite the report, from stored replicates.")] = False,
     gate: Annotated[bool, Option("--gate", help="Fail when a metric is worse than its baselines.json allows.")] = False,
     out: Annotated[File, Option(help="Folder for the results.")] = None,
-) -> Answer:
+) -> Output:
     """Run a study: replicates in parallel, resumable, with provenance in the results.
 
     With --gate exit code 1 if a metric got worse.
@@ -670,7 +670,7 @@ def study(
     worse = regressions(name, quick, report.metrics) if gate else []
     document = {"report": report.text, "metrics": report.metrics, "worse": worse}
     text = "\n".join([f"{report.text}\n", *(f"Worse: {line}" for line in worse)])
-    return Answer(text, document, int(bool(worse)), [folder])
+    return Output(text, document, int(bool(worse)), [folder])
 
 
 @command
@@ -684,7 +684,7 @@ def compare(
     workers: Workers = 1,
     resume: Resume = None,
     out: Annotated[File, Option(help="Folder for the summary, the replicates and the figure.")] = None,
-) -> Answer:
+) -> Output:
     """Compare formulations, selectors and baselines on problems, in pairs, on held-out configurations.
 
     With --out every replicate is stored when it is finished, and README.md with the figure at the end.
@@ -701,16 +701,16 @@ def compare(
         written = [comparison.report(out)]
         journal.unlink()
     document = {"replicates": comparison.rows, "made": comparison.made, "notes": summary.notes}
-    return Answer(f"{comparison!r}\n\n{summary}", document, written=written)
+    return Output(f"{comparison!r}\n\n{summary}", document, written=written)
 
 
 @command
-def robots() -> Answer:
+def robots() -> Output:
     """List the ready robots that a problem file may name."""
     ready = {name: ro.read_robot(name) for name in ro.robots()}
     rows = [{"robot": name, "name": robot.name, "joints": robot.dof} for name, robot in ready.items()]
     text = table(["robot", "name", "joints"], [[str(cell) for cell in row.values()] for row in rows])
-    return Answer(text, {"robots": rows})
+    return Output(text, {"robots": rows})
 
 
 # --- what several commands do ------------------------------------------------------------------------------
@@ -738,10 +738,10 @@ def _saved(result: "ro.calibration.Calibration", out: Path | None) -> list[Path]
     return [file]
 
 
-def _with_table(found: object, rows: str, out: Path | None, document: dict[str, Any], **more: Any) -> Answer:
+def _with_table(found: object, rows: str, out: Path | None, document: dict[str, Any], **more: Any) -> Output:
     """Return what was found, with its table where no file takes it."""
     text = str(found) if out else f"{found}\n{rows.rstrip()}"
-    return Answer(text, document, written=console.written_to(out, rows), **more)
+    return Output(text, document, written=console.written_to(out, rows), **more)
 
 
 def _against(limit: float | None, name: str, value: float) -> tuple[list[str], bool | None]:

@@ -42,14 +42,14 @@ Refit = Callable[[Source, Formulation, Array, int], Array]
 """From a problem, a formulation, a start [SI] and a number of iterations to deviations (n,) near a minimum [SI]."""
 
 
-class Size(NamedTuple):
+class Hyperparameter(NamedTuple):
     """A hyperparameter: the scale of a group of deviations over the stated one, or a part of the noise [m or rad].
 
-    ``spread`` is the standard deviation of its natural logarithm.
+    ``log_std`` is the standard deviation of its natural logarithm.
     """
 
     value: float
-    spread: float
+    log_std: float
 
 
 class Trial(NamedTuple):
@@ -76,8 +76,8 @@ class ExcludedRow(NamedTuple):
 class Transmitted(NamedTuple):
     """Standard deviation and length scale of ripple [rad], and the decrease of -2 ln L."""
 
-    size: Size
-    length: Size
+    size: Hyperparameter
+    length: Hyperparameter
     gain: float
 
 
@@ -85,11 +85,11 @@ class Transmitted(NamedTuple):
 class Learned(Brief):
     """Hyperparameters estimated from the data.
 
-    ``sizes`` are scales of the groups of deviations over the stated ones, ``noise`` the robot's repeatability, in
+    ``scales`` are those of the groups of deviations over the stated ones, ``noise`` the robot's repeatability, in
     ``position`` [m], ``orientation`` and ``joint`` [rad], and ``instrument`` over the stated noise; ``covariance``
     (s, s) that of the logarithms of both. ``local`` (n,) are local scales of deviations over those of their groups, 1
     without heavy tails; ``stated`` (n,) the stated scales [SI]. ``trials`` are the models that were compared, the
-    selected one first, ``value`` is -2 ln of the restricted likelihood at the end, ``freedom`` the degrees of freedom
+    selected one first, ``value`` is -2 ln of the restricted likelihood at the end, ``noise_dof`` the degrees of freedom
     of the variance of a reading (Satterthwaite). D D' of ``drift`` (n, k) is what the uncertainty of hyperparameters,
     heavy tails and what the model lacks outside of the measured ranges add to the covariance [SI]. ``left_out`` are
     outliers that were excluded, the worst first, ``added`` parameters of model extensions, ``notes`` sentences on how
@@ -97,12 +97,12 @@ class Learned(Brief):
     ``curves`` the joints' transmission errors, None without them.
     """
 
-    sizes: Mapping[str, Size]
-    noise: Mapping[str, Size]
+    scales: Mapping[str, Hyperparameter]
+    noise: Mapping[str, Hyperparameter]
     local: Array
     trials: tuple[Trial, ...]
     value: float
-    freedom: float
+    noise_dof: float
     left_out: tuple[ExcludedRow, ...]
     covariance: Array
     stated: Array
@@ -113,7 +113,7 @@ class Learned(Brief):
     curves: Transmitted | None = None
 
     def _short(self) -> str:
-        sizes = ", ".join(f"{name} {size.value:.3g}" for name, size in self.sizes.items())
+        sizes = ", ".join(f"{name} {size.value:.3g}" for name, size in self.scales.items())
         return f"hyperparameters: {sizes}; {len(self.left_out)} rows excluded"
 
     @property
@@ -132,11 +132,11 @@ class Learned(Brief):
         return float(min(without) - min(having))
 
 
-def sessions_spread(learned: Learned | None) -> float:
+def sessions_log_std(learned: Learned | None) -> float:
     """Return the standard error of the logarithm of the session offsets' scale; zero if it was not estimated."""
     if learned is None:
         return 0.0
-    return max((learned.sizes[name].spread for name in SESSIONS.values() if name in learned.sizes), default=0.0)
+    return max((learned.scales[name].log_std for name in SESSIONS.values() if name in learned.scales), default=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +321,7 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     for i, kind in enumerate(evidence.noise, len(growth) - len(evidence.noise)):  # R is a sum of squares of the noises
         growth[i] += 2 * (variance(repeatability) - variance(replace(repeatability, **{kind: 0.0})))
     growth = growth / (float(np.sum((X @ point.C) * X)) + variance(repeatability))
-    values = [Size(float(v), float(s)) for v, s in zip(np.exp(point.logs), spread, strict=True)]
+    values = [Hyperparameter(float(v), float(s)) for v, s in zip(np.exp(point.logs), spread, strict=True)]
     sizes, noise = len(prior.names), len(prior.hyperparameters)
     plain = np.delete(np.arange(len(values)), slice(sizes, noise))  # without the curves'
     size = np.append(np.exp(point.logs[:sizes]), np.nan)[prior.group]
@@ -345,11 +345,11 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         factors = evidence.overdispersion(point, fit.problem.joint_values[fit.problem.owners])
         drift.append(widening(point.C, factors.max()))
     return Learned(
-        sizes=dict(zip(prior.names, values[:sizes], strict=True)),
+        scales=dict(zip(prior.names, values[:sizes], strict=True)),
         noise=dict(zip(evidence.noise, values[noise:], strict=True)),
         local=np.where(np.isfinite(size), local, 1.0),
         value=point.value,
-        freedom=float(max(2 / max(growth @ covariance @ growth, 1e-3), 3.0)),
+        noise_dof=float(max(2 / max(growth @ covariance @ growth, 1e-3), 3.0)),
         covariance=covariance[np.ix_(plain, plain)],
         stated=fit.problem.parameters.free.scale,
         drift=fit.unit[:, None] * np.column_stack(drift),

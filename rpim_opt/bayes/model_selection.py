@@ -229,7 +229,7 @@ class Comparison(Models):
         self.rows = len(np.unique(self.row[self.equations]))
 
     @cached_property
-    def spare(self) -> float:
+    def residual_dof(self) -> float:
         """Degrees of freedom of the residuals, in the result's model."""
         point = self.plain.point
         return len(self.row) - float(np.sum(1 - np.diag(point.C) / point.v))

@@ -231,7 +231,7 @@ def contradicted(
     form = ridge(rest, penalty)
     z = form.minima(np.array([weight]))[0]
     C = form.noise(weight) + form.prior(weight)
-    undecided = form.undecided(weight)
+    undecided = form.undetermined(weight)
     spare = len(rest.b) - form.degrees_of_freedom(weight)
     sigma2 = 1.0
     if spare > 1:

@@ -109,8 +109,8 @@ def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[s
 def data_likelihood(result: Result) -> tuple[tuple[str, ...], Array, Array]:
     """Return names (p), rows (p, p) [1/SI] and values (p,) of the likelihood of a result's data, without frames."""
     free = result.problem.parameters.free
-    spread = result.spread
-    R = spread.linear.triangle / np.sqrt(spread.noise_variance * spread.linear.factor)
+    fit = result.fit_covariance
+    R = fit.linear.qr_factor / np.sqrt(fit.noise_variance * fit.linear.factor)
     n = len(free)
     own = np.eye(n)[free.of_frames] * (free.scale / _stated_widths(result))[free.of_frames, None]
     robot = np.flatnonzero(~free.of_frames)  # frames have their default priors and are integrated out

@@ -277,12 +277,12 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError(f"Prior.from_result, {name}", f"{value}", "a number above zero")
     free = result.problem.parameters.free
-    spread = result.spread
+    fit = result.fit_covariance
     form = result.program.penalty_form
-    variance = spread.linear.factor * (spread.noise_variance if noise is None else noise**2)
-    parts = [spread.linear.triangle[:, : len(free)] / np.sqrt(variance)]
-    if form is not None and spread.weight > 0:
-        parts.append(np.sqrt(spread.weight / variance) * form.matrix)
+    variance = fit.linear.factor * (fit.noise_variance if noise is None else noise**2)
+    parts = [fit.linear.qr_factor[:, : len(free)] / np.sqrt(variance)]
+    if form is not None and fit.weight > 0:
+        parts.append(np.sqrt(fit.weight / variance) * form.matrix)
     if isinstance(without, str):
         without = without.split()
     chosen = np.arange(len(free))
@@ -291,8 +291,8 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
     if not len(chosen):
         raise InputError("Prior.from_result, without", "every parameter", "patterns that keep at least one")
     R = reduced_rows(np.vstack(parts))
-    if spread.drift is not None:  # of the precision that belongs to (R'R)^-1 + D D'
-        moved = R @ (spread.drift / free.scale[:, None])
+    if fit.drift is not None:  # of the precision that belongs to (R'R)^-1 + D D'
+        moved = R @ (fit.drift / free.scale[:, None])
         R = np.linalg.solve(np.linalg.cholesky(np.eye(len(R)) + moved @ moved.T), R)
     rows, _ = marginal(R, np.zeros(len(free)), chosen)
     rows = reduced_rows(rows) / (free.scale[chosen] * inflate)

@@ -180,7 +180,7 @@ def workspace(result: Outcome, requirement: Requirement, region: Region, drawn: 
 def reached_positions(result: Outcome, region: Region, q: Array, confidence: float) -> tuple[Array, Array]:
     """Return predicted positions (N, 3) [m] at configurations (N, dof), and their expanded uncertainties (N,)."""
     prediction = result.predict(q, region.marker, of="reached")
-    return prediction.position, distance_quantile(prediction.covariance, result.freedom, confidence)
+    return prediction.position, distance_quantile(prediction.covariance, result.noise_dof, confidence)
 
 
 def distance_quantile(covariance: Array, freedom: float, probability: float) -> Array:
@@ -512,13 +512,13 @@ def repeatability_bounds(result: Calibration, region: Region, q: Array, confiden
     repeatability = result.problem.repeatability
     if repeatability is not None:
         learned = {} if result.learned is None else result.learned.noise
-        least = {k: 0.0 if s.spread > VAGUE else s.value * float(np.exp(-2 * s.spread)) for k, s in learned.items()}
+        least = {k: 0.0 if s.log_std > VAGUE else s.value * float(np.exp(-2 * s.log_std)) for k, s in learned.items()}
         results.append(replace(result, problem=result.problem.with_repeatability(replace(repeatability, **least))))
     bounds = [0.0, 0.0]
     for i, each in enumerate(results):
         mean, reached = (each.predict(q[None], region.marker, of=of).covariance for of in ("mean", "reached"))
         if np.isfinite(mean).all():
-            bounds[i] = float(distance_quantile(reached - mean, each.freedom, confidence)[0])
+            bounds[i] = float(distance_quantile(reached - mean, each.noise_dof, confidence)[0])
     return bounds[0], bounds[1]
 
 

@@ -23,7 +23,7 @@ UNLIKELY = 0.01  # probability below which the noise is said to be another than 
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
+class FitCovariance:
     """Covariance of a least-squares fit with a quadratic penalty, noise and prior separately (see `Uncertainty`).
 
     ``linear``, ``form`` and ``weight`` are the equations that the fit rests on, their closed form with the penalty, and
@@ -45,7 +45,7 @@ class Spread:
         return self.form.degrees_of_freedom(self.weight)
 
     @property
-    def spare(self) -> float:
+    def residual_dof(self) -> float:
         """Residual degrees of freedom, m - dof; with a robust loss of the equations that it keeps."""
         return self.linear.equations - self.degrees_of_freedom
 
@@ -54,9 +54,9 @@ class Spread:
         """sigma^2 = RSS / (m - dof) in units of the stated variance; 1 without residual degrees of freedom."""
         if self.level is not None:
             return self.level
-        if self.spare <= 1e-6:
+        if self.residual_dof <= 1e-6:
             return 1.0
-        return float(np.sum((self.linear.A @ self.z - self.linear.b) ** 2)) / self.spare / self.linear.factor
+        return float(np.sum((self.linear.A @ self.z - self.linear.b) ** 2)) / self.residual_dof / self.linear.factor
 
     def _in_si(self, C: Array) -> Array:
         scale = self.linear.parameters.scale
@@ -79,7 +79,7 @@ class Spread:
     def covariance(self) -> Array:
         """Covariance (n, n) [SI]; infinite for combinations that neither data nor penalty determine."""
         C = self.noise + self.prior
-        open_ended = np.sum(self.form.undecided(self.weight) ** 2, axis=1) > 1e-12
+        open_ended = np.sum(self.form.undetermined(self.weight) ** 2, axis=1) > 1e-12
         C[open_ended, open_ended] = np.inf
         return C
 
@@ -93,7 +93,7 @@ class Spread:
         variances = np.einsum("nkk->nk", covariance)
         np.maximum(variances, 0.0, out=variances)  # along what a constraint fixes rounding is left
         slopes = J * self.linear.parameters.scale
-        moved = np.linalg.norm(slopes @ self.form.undecided(self.weight), axis=2)
+        moved = np.linalg.norm(slopes @ self.form.undetermined(self.weight), axis=2)
         size = np.linalg.norm(slopes, axis=(1, 2))
         for i, axis in zip(*np.nonzero(moved > UNDECIDED * size[:, None]), strict=True):
             covariance[i, axis, axis] = np.inf
@@ -136,25 +136,25 @@ def position_noise(source: Source) -> Array:
     return np.zeros((3, 3))
 
 
-def coverage_factor(freedom: float | Array, confidence: float) -> Array:
+def coverage_factor(dof: float | Array, confidence: float) -> Array:
     """Return the quantile k of Student's t at (1 + confidence) / 2, with at least one degree of freedom."""
     if not 0 < confidence < 1:
         raise InputError("confidence", f"{confidence}", "a probability between 0 and 1")
-    return np.asarray(stdtrit(np.maximum(freedom, 1.0), (1 + confidence) / 2), dtype=float)
+    return np.asarray(stdtrit(np.maximum(dof, 1.0), (1 + confidence) / 2), dtype=float)
 
 
-def row_freedom(freedom: float, spread: float, whole: Array, session: Array) -> Array:
+def row_dof(dof: float, log_std: float, whole: Array, session: Array) -> Array:
     """Return the degrees of freedom (N,) of the rows' variances, at least one; few sessions reduce them.
 
-    2 V^2 / var(V) of the sum V of both parts' variances (Satterthwaite), with ``freedom`` that of what no session adds,
-    ``spread`` the standard deviation of the logarithm of the session offsets' size, and covariances (N, k, k) of a row
+    2 V^2 / var(V) of the sum V of both parts' variances (Satterthwaite), with ``dof`` that of what no session adds,
+    ``log_std`` the standard deviation of the logarithm of the session offsets' size, and covariances (N, k, k) of a row
     and of what an unknown session adds to it.
     """
-    freedom = max(freedom, 1.0)
+    dof = max(dof, 1.0)
     V = np.einsum("nkk->n", whole)
     part = np.broadcast_to(np.einsum("nkk->n", session), V.shape)
-    variance = 2 * (V - part) ** 2 / freedom + (2 * spread * part) ** 2
-    return np.maximum(np.minimum(2 * V**2 / np.maximum(variance, 1e-300), freedom), 1.0)
+    variance = 2 * (V - part) ** 2 / dof + (2 * log_std * part) ** 2
+    return np.maximum(np.minimum(2 * V**2 / np.maximum(variance, 1e-300), dof), 1.0)
 
 
 class NoiseTest(NamedTuple):
@@ -170,18 +170,18 @@ class NoiseTest(NamedTuple):
         return self.probability < UNLIKELY and self.ratio < 1
 
 
-def noise_test(squares: float, freedom: float, learned: bool = False, factor: float = 1.0) -> NoiseTest:
+def noise_test(squares: float, dof: float, learned: bool = False, factor: float = 1.0) -> NoiseTest:
     """Compare a sum of squared whitened residuals with its chi-squared distribution.
 
     ``learned``: the repeatability is known beside the noise; ``factor``: what is estimated on the stated noise.
     """
-    if freedom < 1:
+    if dof < 1:
         return NoiseTest(1.0, 1.0, "No degrees of freedom remain to test the measurement noise.")
-    ratio = float(np.sqrt(squares / freedom))
-    upper = float(chdtrc(freedom, squares))
+    ratio = float(np.sqrt(squares / dof))
+    upper = float(chdtrc(dof, squares))
     probability = 2 * min(upper, 1 - upper)
     if probability >= UNLIKELY:
-        low, high = np.sqrt(chdtri(freedom, [1 - UNLIKELY / 2, UNLIKELY / 2]) / freedom)
+        low, high = np.sqrt(chdtri(dof, [1 - UNLIKELY / 2, UNLIKELY / 2]) / dof)
         found = f"ratio {ratio:.2f}; by chance {low:.2f} to {high:.2f} in {100 * (1 - UNLIKELY):g} % of fits"
         return NoiseTest(ratio, probability, f"Residuals agree with the measurement noise ({found}).")
     cause = "the noise is larger than stated, rows are wrong, or the model lacks an effect (backlash, compliance)"

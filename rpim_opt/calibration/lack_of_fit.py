@@ -79,7 +79,7 @@ class Autocorrelation(NamedTuple):
 class LackOfFit:
     """Components of a calibration's residuals, as RMS of vectors over the rows [m; rad or px without lengths].
 
-    ``spare`` is how many of the ``equations`` the deviations leave over; below 6 nothing else is judged. ``left`` is
+    ``residual_dof`` are residual degrees of freedom of the ``equations``; below 6 nothing else is judged. ``left`` is
     the RMS of the errors; ``instrument`` (as stated or estimated), ``position`` (the robot's repeatability in position,
     without lengths in orientation) and ``joint`` are the noise's parts, ``repeatable`` is what the extensions
     ``missing`` would explain: a ``share`` of the mean square residual, -2 ln L falling by ``gain``; ``parameters`` are
@@ -92,7 +92,7 @@ class LackOfFit:
 
     configurations: int
     equations: int
-    spare: float
+    residual_dof: float
     dimension: str
     left: float
     instrument: float = 0.0
@@ -129,7 +129,7 @@ class LackOfFit:
         """Return the paragraph, sentence by sentence."""
         rms = f"Residual RMS per reading {_size(self, self.left)}"
         if not self.instrument:
-            count = max(round(self.spare), 0)
+            count = max(round(self.residual_dof), 0)
             degrees = "1 degree of freedom is" if count == 1 else f"{count} degrees of freedom are"
             return [f"{rms}; {degrees} too few to separate its components. Measure more configurations."]
         parts = [f"measurement noise {_size(self, self.instrument)}"]
@@ -188,11 +188,11 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     known: dict[str, Any] = {
         "configurations": compared.configurations,
         "equations": len(compared.row),
-        "spare": compared.spare,
+        "residual_dof": compared.residual_dof,
         "dimension": dimension,
         "left": float(np.sqrt(np.nanmean(problem.errors(result.x, dimension) ** 2))),
     }
-    if compared.spare < FEWEST:
+    if compared.residual_dof < FEWEST:
         return LackOfFit(**known)
     best = compared.best
     # an update keeps the repeatability of the calibration before it, which few new readings do not tell
@@ -211,7 +211,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     excess = 0.0
     if again is not None:
         within = max(again**2, 1e-24)
-        if total / within >= fdtri(compared.spare, freedom, 1 - RARE):
+        if total / within >= fdtri(compared.residual_dof, freedom, 1 - RARE):
             excess = float(np.sqrt(total - within))
     return LackOfFit(
         **known,

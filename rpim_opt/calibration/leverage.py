@@ -98,7 +98,7 @@ def influence(result: Outcome) -> Influence:
     formulation = result.formulation
     if not result.squared_loss:  # squares with the weights that the loss ended with
         model, _ = QuadraticModel(formulation.loss, formulation.name, formulation.loss_over)(model, result.z)
-    A, b = model.triangle[:, :-1], model.triangle[:, -1]
+    A, b = model.qr_factor[:, :-1], model.qr_factor[:, -1]
     L, c = np.zeros((0, len(free))), np.zeros(0)
     form = result.program.penalty_form
     if form is not None:
@@ -200,7 +200,7 @@ def improvement(result: Outcome) -> Improvement | None:
     (True, True)
     """
     try:
-        noise, prior = result.spread.noise, result.spread.prior
+        noise, prior = result.fit_covariance.noise, result.fit_covariance.prior
         D, directions = _slopes(result)
         change = influence(result).change
     except InputError:
@@ -215,7 +215,7 @@ def improvement(result: Outcome) -> Improvement | None:
     by_prior = float(np.sum((D @ prior) * D))
     before = float(np.sum((D @ result.x) ** 2)) - by_noise + by_prior
     each = np.einsum("nij,jk,nik->ni", directions, noise + prior, directions)
-    factor = coverage_factor(result.freedom, CONFIDENCE)
+    factor = coverage_factor(result.noise_dof, CONFIDENCE)
     return Improvement(
         before=float(np.sqrt(max(before, 0.0) / count)),
         after=float(np.sqrt((by_noise + by_prior) / count)),

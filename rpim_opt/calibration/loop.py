@@ -277,7 +277,7 @@ class Loop:
             state = self.confirmed(self.advanced(self.chosen(state)))
             if self.options.progress and len(state.history) > iterations:
                 self.options.progress(state.history[-1])
-        return self.answered(state)
+        return self.selected(state)
 
     def initial(self, choice: WeightChoice, start: Array | None) -> State:
         """Return the initial state, at a feasible point."""
@@ -323,7 +323,7 @@ class Loop:
             return replace(state, choice=choice)
         return replace(state.weighted(choice), outcome="")
 
-    def answered(self, state: State) -> State:
+    def selected(self, state: State) -> State:
         """Apply the rule if it was never applied."""
         if state.choice.final or state.choice.weights:
             return state
@@ -363,7 +363,7 @@ class Loop:
             return replace(state, outcome="rest")
         waiting = choice.settled and not choice.final and not choice.weights
         if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
-            return self.answered(state)
+            return self.selected(state)
         return self._stepped(state, solution, promised, short, accuracy)
 
     def _stepped(self, state: State, solution: Array, promised: float, short: bool, accuracy: float) -> State:

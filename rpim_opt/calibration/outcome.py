@@ -14,21 +14,21 @@ from scipy.special import chdtrc
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, choices
 from rpim_opt.basics.text import joined, three_digits
-from rpim_opt.bayes.hyperparameters import Learned, sessions_spread
+from rpim_opt.bayes.hyperparameters import Learned, sessions_log_std
 from rpim_opt.bayes.outliers import by_block, coherent, contradicted, error_vectors
 from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration import diagnosis
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.covariance import (
     UNLIKELY,
+    FitCovariance,
     Interval,
     NoiseTest,
-    Spread,
     coverage_factor,
     noise_covariances,
     noise_test,
     position_noise,
-    row_freedom,
+    row_dof,
 )
 from rpim_opt.calibration.diagnosis import ActiveBound, Flag, Outside, ShadowPrice
 from rpim_opt.calibration.loop import Iteration
@@ -228,7 +228,7 @@ class Outcome:
         """
         if of not in get_args(Interval):
             raise InputError("of", f"'{of}'", choices(of, get_args(Interval)))
-        spread = self.spread  # refuses a penalty without covariance before anything is computed
+        fit = self.fit_covariance  # refuses a penalty without covariance before anything is computed
         noise = position_noise(self.problem)
         problem = self.problem.sample().measuring(q, position, marker, torque, payload, columns, robot, noise)
         N = len(problem.data)
@@ -240,12 +240,12 @@ class Outcome:
             parts, problem.modelled(self.x), whole, added.session, strict=True
         ):
             at[block.row] = positions
-            covariance[block.row] = spread.of_positions(J) + more
+            covariance[block.row] = fit.of_positions(J) + more
             session[block.row] = sessions
-        factor = COVERAGE_FACTOR if confidence is None else coverage_factor(self.freedom, confidence)
+        factor = COVERAGE_FACTOR if confidence is None else coverage_factor(self.noise_dof, confidence)
         if of == "reading" and confidence is not None and session.any():
-            freedom = row_freedom(self.freedom, sessions_spread(self.learned), covariance, session)
-            factor = coverage_factor(freedom, confidence)[:, None]
+            dof = row_dof(self.noise_dof, sessions_log_std(self.learned), covariance, session)
+            factor = coverage_factor(dof, confidence)[:, None]
         return Prediction(at, covariance, factor, self.outside(problem.data))
 
     def outside(self, data: Dataset) -> Outside:
@@ -371,7 +371,7 @@ class Outcome:
         return self.program.tangent(self.z, self.penalty_weight) if self.formulation.solvable else None
 
     @cached_property
-    def spread(self) -> Spread:
+    def fit_covariance(self) -> FitCovariance:
         """Covariance of the fit, from the equations that it keeps and its penalty.
 
         InputError for a penalty that is not quadratic, or a loss without a quadratic model.
@@ -382,7 +382,7 @@ class Outcome:
         if self.moves is not None:  # conditional on the active constraints
             form = ridge_within(self.squares, self.program.penalty_form, self.moves, self.z)
         level, drift = (None, None) if self.learned is None else (1.0, self.learned.drift)
-        return Spread(self.squares, form, self.penalty_weight, self.z, level, drift)
+        return FitCovariance(self.squares, form, self.penalty_weight, self.z, level, drift)
 
     @property
     def _undefined(self) -> str:
@@ -409,7 +409,7 @@ class Outcome:
         """Ratio of the noise variance to the stated one if significantly larger, otherwise 1."""
         if self.known_covariance is None or self.noise_test().probability >= UNLIKELY:
             return 1.0
-        return max(self.spread.noise_variance, 1.0)
+        return max(self.fit_covariance.noise_variance, 1.0)
 
     def noise_test(self) -> NoiseTest:
         """Test the residuals against the measurement noise.
@@ -422,17 +422,17 @@ class Outcome:
         repeatability = self.problem.repeatability
         if repeatability is None:
             squares = float(np.sum((linear.A @ self.z - linear.b) ** 2)) / linear.factor
-            return noise_test(squares, self.spread.spare)
+            return noise_test(squares, self.fit_covariance.residual_dof)
         bare = self.problem.with_repeatability(None)
         squares = float(sum(np.sum(part.whitened_errors(self.x)[0] ** 2) for part in bare.rows()))
-        return noise_test(squares, self.spread.spare, True, repeatability.instrument)
+        return noise_test(squares, self.fit_covariance.residual_dof, True, repeatability.instrument)
 
     @property
-    def freedom(self) -> float:
+    def noise_dof(self) -> float:
         """Degrees of freedom of the noise: those of its estimate, or the residual ones, m - sum f."""
         if self.learned is not None:
-            return self.learned.freedom
-        return max(self.spread.spare, 0.0)
+            return self.learned.noise_dof
+        return max(self.fit_covariance.residual_dof, 0.0)
 
     @property
     def covariance(self) -> Array:
@@ -441,7 +441,7 @@ class Outcome:
         `Uncertainty` documents its contents and validity; D D' is zero with a weight of your own. It is
         conditional on active constraints; variances that neither data nor penalty decide are infinite.
         """
-        return self.spread.covariance
+        return self.fit_covariance.covariance
 
     @property
     def known_covariance(self) -> Array | None:

@@ -10,10 +10,10 @@ from scipy.special import bdtr, fdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import Tabled, listed
-from rpim_opt.bayes.hyperparameters import sessions_spread
+from rpim_opt.bayes.hyperparameters import sessions_log_std
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.transmission import series
-from rpim_opt.calibration.covariance import UNLIKELY, coverage_factor, noise_covariances, position_noise, row_freedom
+from rpim_opt.calibration.covariance import UNLIKELY, coverage_factor, noise_covariances, position_noise, row_dof
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.pose import position
@@ -52,7 +52,7 @@ class Uncertainty(Tabled):
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> uncertainty = ro.calibration.Uncertainty(result, confidence=0.95)
-    >>> print(f"{result.freedom:.1f} degrees of freedom, k = {uncertainty.coverage_factor:.2f}")
+    >>> print(f"{result.noise_dof:.1f} degrees of freedom, k = {uncertainty.coverage_factor:.2f}")
     93.5 degrees of freedom, k = 1.99
     >>> list(uncertainty.to_frame().columns)
     ['parameter', 'unit', 'value', 'u_noise', 'u_prior', 'u', 'U', 'actively_constrained']
@@ -62,12 +62,12 @@ class Uncertainty(Tabled):
     confidence: float = 0.95
 
     def __post_init__(self) -> None:
-        coverage_factor(self.result.spread.spare, self.confidence)  # which refuse what has no covariance, or interval
+        coverage_factor(self.result.fit_covariance.residual_dof, self.confidence)  # refuse what has no interval
 
     @property
     def coverage_factor(self) -> float:
         """Coverage factor k, the Student-t quantile at (1 + confidence) / 2 with at least one degree of freedom."""
-        return float(coverage_factor(self.result.freedom, self.confidence))
+        return float(coverage_factor(self.result.noise_dof, self.confidence))
 
     @property
     def expanded(self) -> Array:
@@ -80,8 +80,8 @@ class Uncertainty(Tabled):
     def _frame_rows(self) -> list[dict[str, Any]]:
         """Return the budget in GUM's terms: values, standard uncertainties u by what causes them, and U = k u."""
         free = self.result.problem.parameters.free
-        spread = self.result.spread
-        noise, prior, both = (np.sqrt(np.diag(C)) for C in (spread.noise, spread.prior, spread.covariance))
+        fit = self.result.fit_covariance
+        noise, prior, both = (np.sqrt(np.diag(C)) for C in (fit.noise, fit.prior, fit.covariance))
         columns = {"value": free.values(self.result.x), "u_noise": noise, "u_prior": prior, "u": both}
         columns["U"] = self.expanded
         constrained = (both == 0) | np.isin(free.names, self.result.actively_constrained)
@@ -91,7 +91,7 @@ class Uncertainty(Tabled):
     def _notes(self) -> list[str]:
         lines = [
             self.result.noise_test().verdict,
-            f"k = {self.coverage_factor:.2f}; {self.result.freedom:.1f} degrees of freedom.",
+            f"k = {self.coverage_factor:.2f}; {self.result.noise_dof:.1f} degrees of freedom.",
         ]
         if any(row["actively_constrained"] for row in self._frame_rows()):
             lines.append("At an active bound or constraint: the interval is conditional on it.")
@@ -100,14 +100,14 @@ class Uncertainty(Tabled):
 
 def position_budget(result: Outcome, q: Array, marker: str | None = None) -> dict[str, Array]:
     """Return the contributions to u^2 (N,) [m^2] of the positions reached at q (N, dof), summed over all axes."""
-    spread = result.spread
+    fit = result.fit_covariance
     there = result.problem.sample().measuring(q, position, marker, covariance=position_noise(result.problem))
     J = there.jacobian(result.x).reshape(len(q), 3, -1)
-    prior = np.einsum("nij,jk,nik->n", J, spread.prior, J)
-    drift = np.zeros(len(q)) if spread.drift is None else np.sum((J @ spread.drift) ** 2, axis=(1, 2))
+    prior = np.einsum("nij,jk,nik->n", J, fit.prior, J)
+    drift = np.zeros(len(q)) if fit.drift is None else np.sum((J @ fit.drift) ** 2, axis=(1, 2))
     robot = np.trace(noise_covariances(there, result.variance_factor).robot[0], axis1=1, axis2=2)
     return {
-        "measurement noise in the parameters": np.einsum("nij,jk,nik->n", J, spread.noise, J),
+        "measurement noise in the parameters": np.einsum("nij,jk,nik->n", J, fit.noise, J),
         "prior, in combinations that the data hardly identify": prior - drift,
         "estimated prior scales and variance components": drift,
         "repeatability of the robot": np.broadcast_to(robot, len(q)),
@@ -184,13 +184,13 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
     """Return deviations (draws, n) [SI] identified from data simulated at the fit with noise of the observed level.
 
     The check of the law of propagation (JCGM 101), with bounds and any loss: the spread of the draws is to be compared
-    with `Spread.noise`. Every draw solves the linearized program at the same weight.
+    with `FitCovariance.noise`. Every draw solves the linearized program at the same weight.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> spread = ro.calibration.monte_carlo(result, draws=500).std(axis=0)
-    >>> stated = np.sqrt(np.diag(result.spread.noise))
+    >>> stated = np.sqrt(np.diag(result.fit_covariance.noise))
     >>> bool(np.abs(spread / stated - 1).max() < 0.2)  # 500 draws tell each to 3 %
     True
     """
@@ -198,7 +198,7 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
     program = result.program
     fitted = program.model.A @ result.z
     if result.known_covariance is not None:
-        variance = result.spread.noise_variance
+        variance = result.fit_covariance.noise_variance
     else:  # no degrees of freedom are known: as many as parameters
         squares = np.sum((fitted - program.model.b) ** 2)
         variance = squares / max(program.model.equations - len(result.z), 1)
@@ -235,15 +235,15 @@ def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None =
         k = len(block.measurement.components)
         r, A = part[:, :, 0], part[:, :, 1:]
         S = A @ C @ A.transpose(0, 2, 1) + reading
-        freedom = row_freedom(result.freedom, sessions_spread(result.learned), S, session)
+        dof = row_dof(result.noise_dof, sessions_log_std(result.learned), S, session)
         squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)
         predicted = (A[:, :, ~known] == 0).all(axis=(1, 2))
         predicted &= np.einsum("nkk->n", session - UNINFORMATIVE * (reading - session)) < 0
         sigmas[block.row] = np.where(predicted, np.sqrt(squares), np.nan)
-        limit = np.sqrt(k * fdtri(k, freedom, 1 - RARE / N))
+        limit = np.sqrt(k * fdtri(k, dof, 1 - RARE / N))
         allowed[block.row] = np.where(predicted, limit, np.nan)
         lengths = np.array([d in ("length", "pixel") for d in block.measurement.components.values()])
-        factor = coverage_factor(freedom, CONFIDENCE)[:, None]
+        factor = coverage_factor(dof, CONFIDENCE)[:, None]
         within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
         inside.append(within[predicted & counted[block.row]][:, lengths].ravel())
     covered = np.concatenate(inside)

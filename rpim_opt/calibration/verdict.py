@@ -24,7 +24,7 @@ from rpim_opt.data.record import HeldOut
 from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.diagnosis import ANGULAR, NOISY, NOTICED, REACH, SLIGHT, decimals_of, first
-from rpim_opt.problem.misreadings import Better, better_reading, sibling
+from rpim_opt.problem.misreadings import Better, better_interpretation, sibling
 from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
@@ -341,7 +341,7 @@ def _worse(result: Outcome) -> Iterator[str]:
         held = held_out_errors(result, validation)
     if held is None:
         checked = result.record.earlier or result.known_covariance is None  # an update is judged against what was known
-        if not checked and result.spread.spare < INTERPOLATED:
+        if not checked and result.fit_covariance.residual_dof < INTERPOLATED:
             yield (
                 f"The fit interpolates the data: {result.program.model.equations} equations leave no residual degrees "
                 "of freedom, and no validation data check it. Measure more configurations."
@@ -407,9 +407,9 @@ def likely_causes(result: Outcome) -> list[str]:
     """Return the likely causes of a poor fit, one sentence each; empty if the fit is good.
 
     A fit is bad if it did not converge, leaves residuals of `NOISY` times the instrument's stated noise in rows that it
-    does not downweight, or deviates by many scales. Then the table is read in other ways (`better_reading`), and rows
-    without value, exchanged rows, rounded joints and a base that moved are looked for. Where residuals are beyond the
-    noise at all, something systematic is looked for in them, and in excluded rows what they have in common. Known
+    does not downweight, or deviates by many scales. Then other interpretations (`better_interpretation`), rows without
+    value, exchanged rows, rounded joints and a base that moved are looked for. Where residuals are beyond the noise at
+    all, something systematic is looked for in them, and in excluded rows what they have in common. Known
     values that the data contradict come first, and are all that is said of data in blocks.
 
     >>> from dataclasses import replace
@@ -628,7 +628,7 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
     most = REACH * arm_length(problem) if explained else np.inf  # else wrong lengths explain more
     # beside single rows, which may be the ones where something changed
     return first(
-        chain(diagnosis.single_rows(ordered), diagnosis.other_readings(ordered, most)),
+        chain(diagnosis.single_rows(ordered), diagnosis.better_interpretations(ordered, most)),
         _shown_without_outliers(result, ordered),
         diagnosis.rounded(problem, error),
         diagnosis.odd_column(problem) if beyond else (),
@@ -682,7 +682,7 @@ def _in_place_of_extensions(result: Outcome, alone: CalibrationProblem) -> Itera
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:
     """Return the interpretation of new measurements that fits far better; None if they fit, or if there is none."""
     problem = result.problem.sample().on(data)
-    return better_reading(problem) if noise_ratio(problem, result.errors(data)) > HOPELESS else None
+    return better_interpretation(problem) if noise_ratio(problem, result.errors(data)) > HOPELESS else None
 
 
 def refuse_misread(result: Outcome, data: Dataset) -> None:

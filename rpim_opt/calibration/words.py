@@ -10,7 +10,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.units import display, printed
-from rpim_opt.bayes.hyperparameters import Learned, Size
+from rpim_opt.bayes.hyperparameters import Hyperparameter, Learned
 from rpim_opt.bayes.prior import BASE, SESSIONS
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import transmission_errors
@@ -206,7 +206,7 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
 def _estimates(learned: Learned, names: tuple[str, ...], z: Array) -> dict[str, list[str]]:
     """Return the estimates as texts: prior scales, repeatability beside its largest part, noise, and conditions."""
     groups, deflections, curves = [], [], []
-    for name, size in learned.sizes.items():
+    for name, size in learned.scales.items():
         if name in DEFLECTIONS:
             deflections.append(f"{DEFLECTIONS[name]} {_figure(size, 1e3 * EXPECTED, 'mrad')}")
         elif name not in (*SESSIONS.values(), BASE, EXPANSION):
@@ -224,14 +224,14 @@ def _estimates(learned: Learned, names: tuple[str, ...], z: Array) -> dict[str, 
     instrument = [] if factor is None else [_figure_or_bound(factor, 1.0, "x the stated one")]
     sessions = []  # of a coordinate, and of an axis
     for dimension, group in SESSIONS.items():
-        if group in learned.sizes:
+        if group in learned.scales:
             turn = dimension == "angle"
             of = [of_session(name) and own_name(name).rpartition("_")[2].startswith("r") == turn for name in names]
             scale = learned.stated[of.index(True)]
-            sessions.append(_figure_or_bound(learned.sizes[group], 1e3 * scale, "mrad" if turn else "mm"))
+            sessions.append(_figure_or_bound(learned.scales[group], 1e3 * scale, "mrad" if turn else "mm"))
     expansion = []
-    if EXPANSION in learned.sizes:
-        per_kelvin = 1e6 * learned.stated * learned.sizes[EXPANSION].value * z
+    if EXPANSION in learned.scales:
+        per_kelvin = 1e6 * learned.stated * learned.scales[EXPANSION].value * z
         of = [own_name(name) == EXPANSION for name in names]
         expansion = [f"{value:.3g} um/(m K)" for value in per_kelvin[of]]
     return {
@@ -260,18 +260,18 @@ def _model_lines(learned: Learned) -> list[str]:
     ]
 
 
-def _figure(size: Size, factor: float, unit: str) -> str:
+def _figure(size: Hyperparameter, factor: float, unit: str) -> str:
     """Return a hyperparameter with its 95 % confidence interval as text."""
-    spread = np.exp(TWO_SIDED * min(size.spread, 7.0))
+    spread = np.exp(TWO_SIDED * min(size.log_std, 7.0))
     value, low, high = (f"{float(f'{factor * size.value * by:.2g}'):,g}" for by in (1.0, 1 / spread, spread))
     return f"{value} {unit} (95 % CI {low} to {high})"
 
 
-def _figure_or_bound(size: Size, factor: float, unit: str) -> str:
+def _figure_or_bound(size: Hyperparameter, factor: float, unit: str) -> str:
     """Return the same, or an upper bound with 95 % confidence where little more is known."""
-    if size.spread <= VAGUE:
+    if size.log_std <= VAGUE:
         return _figure(size, factor, unit)
-    return f"at most {factor * size.value * np.exp(ONE_SIDED * size.spread):.2g} {unit} (95 % confidence)"
+    return f"at most {factor * size.value * np.exp(ONE_SIDED * size.log_std):.2g} {unit} (95 % confidence)"
 
 
 def camera_remarks(result: Outcome) -> list[str]:

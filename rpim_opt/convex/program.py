@@ -21,7 +21,7 @@ from rpim_opt.convex.expressions import OPTIMAL, cp, substituted
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
 from rpim_opt.convex.robust_loss import Inliers, inliers_of
-from rpim_opt.convex.solvers.conic import FEASIBLE, Damping, Point, Unsolved, by_triangle, nearest
+from rpim_opt.convex.solvers.conic import FEASIBLE, Damping, Point, Unsolved, nearest, triangular_solution
 from rpim_opt.convex.solvers.separable import Rows
 from rpim_opt.convex.solvers.solve import WarmStart, minimum
 from rpim_opt.convex.structure import Structure, structure
@@ -199,7 +199,7 @@ class Program(Brief):
         n = self.model.A.shape[1]
         if self.structure.equations == len(self.model.b):
             return self.model.A, self.model.b
-        return self.model.triangle[:, :n], self.model.triangle[:, n]
+        return self.model.qr_factor[:, :n], self.model.qr_factor[:, n]
 
     @cached_property
     def _rows(self) -> Rows:
@@ -210,7 +210,7 @@ class Program(Brief):
             order, counts = np.argsort(self.structure.groups, kind="stable"), np.bincount(self.structure.groups)
             A, b = A[order], b[order]
         model = self.model if self.loss_form is None else self.squared
-        return Rows(A, b, counts, model.triangle)
+        return Rows(A, b, counts, model.qr_factor)
 
     # --- values --------------------------------------------------------------------------------------------------
 
@@ -375,12 +375,12 @@ class Program(Brief):
 
     def _closed(self, weight: float) -> Array:
         """Return the minimum (n,) of squares and a quadratic penalty, by QR unless it is ill-conditioned."""
-        n, form, rows = self.structure.n, self.penalty_form, self.squared.triangle
+        n, form, rows = self.structure.n, self.penalty_form, self.squared.qr_factor
         if form is not None and weight > 0:
             rows = np.vstack([rows, np.sqrt(weight) * np.column_stack([form.matrix, form.c])])
         T = reduced_rows(rows)
         if TRCON(T[:n, :n])[0] > WELL_CONDITIONED:
-            return by_triangle(T[:n, :n], T[:n, n])
+            return triangular_solution(T[:n, :n], T[:n, n])
         z = self.ridge.minima(np.array([weight]))[0]
         if form is not None and weight > 0 and not (form.diagonal and (form.L == 1).all()):
             # a penalty that hardly holds some directions costs the formula digits
@@ -393,7 +393,7 @@ class Program(Brief):
         checked = np.array([self._weight(weight) for weight in weights])
         if self.closed_form:
             Z = self.ridge.minima(checked)
-            R, n, form = self.squared.triangle, self.structure.n, self.penalty_form
+            R, n, form = self.squared.qr_factor, self.structure.n, self.penalty_form
             losses = np.sum((Z @ R[:, :n].T - R[:, n]) ** 2, axis=1) + self.squared.offset
             penalties = np.zeros(len(Z))
             if form is not None:

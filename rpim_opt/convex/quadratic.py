@@ -165,38 +165,38 @@ class Ridge:
     null: Array
 
     @property
-    def fixed(self) -> int:
+    def unpenalized(self) -> int:
         """Number of identifiable directions that the penalty leaves free."""
         return self.free.shape[1]
 
     @cached_property
-    def seen(self) -> np.ndarray:
+    def identifiable(self) -> np.ndarray:
         """Which of the p penalized directions are identifiable."""
         return self.s > 0
 
     @property
     def filters(self) -> tuple[Array, Array, float]:
         """beta^2 and s^2 of the identifiable directions, and the residual sum of squares that no weight can reduce."""
-        seen = self.seen
-        return self.beta[seen] ** 2, self.s[seen] ** 2, self.perp
+        kept = self.identifiable
+        return self.beta[kept] ** 2, self.s[kept] ** 2, self.perp
 
     def minima(self, weights: Array) -> Array:
         """Return the minima (K, n) at weights (K,)."""
         gain = np.zeros((len(weights), len(self.s)))
-        seen = self.seen
-        gain[:, seen] = self.s[seen] * self.beta[seen] / (self.s[seen] ** 2 + weights[:, None])
+        kept = self.identifiable
+        gain[:, kept] = self.s[kept] * self.beta[kept] / (self.s[kept] ** 2 + weights[:, None])
         return self.offset + gain @ self.B.T
 
     def degrees_of_freedom(self, weight: float) -> float:
         """Return the trace of the influence matrix."""
-        s2 = self.s[self.seen] ** 2
-        return self.fixed + float(np.sum(s2 / (s2 + weight)))
+        s2 = self.s[self.identifiable] ** 2
+        return self.unpenalized + float(np.sum(s2 / (s2 + weight)))
 
     def misfits(self, weights: Array) -> tuple[Array, Array]:
         """Return |A z - b|^2, without what the penalty's centre adds, and the degrees of freedom at weights (K,)."""
         beta2, s2, perp = self.filters
         g = weights[:, None] / (s2 + weights[:, None])
-        return g**2 @ beta2 + perp, self.fixed + np.sum(1 - g, axis=1)
+        return g**2 @ beta2 + perp, self.unpenalized + np.sum(1 - g, axis=1)
 
     def noise(self, weight: float) -> Array:
         """Return the covariance (n, n) of the minimum for unit noise of b."""
@@ -210,16 +210,16 @@ class Ridge:
         by = np.divide(weight, total**2, out=np.zeros_like(total), where=total > 0)
         return (self.B * by) @ self.B.T
 
-    def undecided(self, weight: float) -> Array:
+    def undetermined(self, weight: float) -> Array:
         """Return the directions (n, u) that neither data nor penalty determine."""
         if weight > 0:
             return self.null
-        return np.hstack([self.null, self.B[:, ~self.seen]])
+        return np.hstack([self.null, self.B[:, ~self.identifiable]])
 
 
 def ridge(model: LinearModel, penalty: Quadratic | None) -> Ridge:
     """Decompose a linear model and a squared penalty; without a penalty, directions of the null space stay nominal."""
-    R = model.triangle
+    R = model.qr_factor
     n = R.shape[1] - 1
     A, b = R[:n, :n], R[:n, n]
     # z = start + T y + N y0 with |L z - c|^2 = |y|^2 + const; T is None for the identity

@@ -23,7 +23,7 @@ SMALL = 1e-6
 SHARE, STEP = 0.3, 1e-4
 """A step is expected to move a residual by this part of what the last one did, and by this part of it at least."""
 CROSSING = 0.3
-"""Where a loss has a kink at zero: residuals that moved by more than this part of themselves may yet end there."""
+"""Where a loss is not smooth at zero: residuals that moved by more than this part of themselves may yet end there."""
 LEAST_CURVATURE = 1e-3
 """Curvature along a residual, relative to that across it, where the loss has less: a square needs some."""
 SEPARATE = 1e-9

@@ -68,9 +68,9 @@ class Expressions:
         where = f"formulation '{formulation.name}'"
         z = self.z = Unknown(parameters.names)
         r = self.r = cp.Variable(equations, name="r")
-        seen: cp.Variable = r
+        argument: cp.Variable = r
         if formulation.loss_over == "configuration":
-            seen = cp.Variable(len(np.unique(groups)))
+            argument = cp.Variable(len(np.unique(groups)))
         self.differences: list[Array] = []
         penalized: cp.Variable = z
         instead: dict[int, Any] = {}
@@ -84,9 +84,9 @@ class Expressions:
             penalized = cp.Variable(len(self.differences))
             which = np.repeat(np.arange(len(self.differences)), [len(D) for D in self.differences])
             instead = {id(penalized): norms(np.vstack(self.differences) @ z, which)}
-        frozen = Frozen([z, r, seen, penalized], where)
-        live_loss = scalar(called(formulation.loss, f"{where}, loss", seen), f"{where}, loss")
-        self.loss = Term(frozen(live_loss), seen)
+        frozen = Frozen([z, r, argument, penalized], where)
+        live_loss = scalar(called(formulation.loss, f"{where}, loss", argument), f"{where}, loss")
+        self.loss = Term(frozen(live_loss), argument)
         live_penalty: Any = None
         self.penalty: Any = None
         self.penalty_of_z: Any = None
@@ -102,8 +102,8 @@ class Expressions:
             of = f"{where}, {name_of(constraint, k)}"
             live.append(listed(called(constraint, of, z, known), of))
         composed = {"penalty": self.penalty_of_z} if instead and self.penalty is not None else {}
-        if seen is not r:  # norms are convex and nonnegative, as absolute values are
-            composed["loss"] = substituted(self.loss.expression, {id(seen): cp.abs(cp.Variable(seen.size))})
+        if argument is not r:  # norms are convex and nonnegative, as absolute values are
+            composed["loss"] = substituted(self.loss.expression, {id(argument): cp.abs(cp.Variable(argument.size))})
         for what, expression in composed.items():
             if not expression.is_convex():
                 accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
@@ -191,8 +191,8 @@ class Structure:
 
     def of_r(self, stated: Any) -> Any:
         """Return an expression of the loss's argument as one of r."""
-        seen, r = self.expressions.loss.variable, self.expressions.r
-        return stated if seen is r else substituted(stated, {id(seen): norms(r, self.groups)})
+        argument, r = self.expressions.loss.variable, self.expressions.r
+        return stated if argument is r else substituted(stated, {id(argument): norms(r, self.groups)})
 
     @cached_property
     def on_squares(self) -> Structure:
@@ -311,7 +311,7 @@ class Structure:
         """Return loss and penalty at numbers; minimized over the functions' own variables."""
         if not self.inner:
             return self.loss_of(r), self.penalty_of(z)
-        a, v, form = self.expressions, self.seen(r), self.loss
+        a, v, form = self.expressions, self.argument(r), self.loss
         if form is not None and form.threshold is not None and not (self.joint or a.owned(a.penalty_of_z)):
             return form.best(v)[0], self.penalty_of(z)
         with self._lock:
@@ -342,7 +342,7 @@ class Structure:
         """Return the loss of a residual (m,)."""
         if self.formulation.loss == SQUARES:  # of residuals or of norms
             return float(r @ r)
-        return self.expressions.loss(self.seen(r))
+        return self.expressions.loss(self.argument(r))
 
     def penalty_of(self, z: Array) -> float:
         """Return the penalty of z (n,)."""
@@ -353,7 +353,7 @@ class Structure:
         form = declared_form(self.formulation.penalty, len(z))
         return self.expressions.penalty(z) if form is None else form.value(z)
 
-    def seen(self, r: Array) -> Array:
+    def argument(self, r: Array) -> Array:
         """Return the argument of the loss for a residual: the residual, or the norms of the configurations."""
         return np.sqrt(np.bincount(self.groups, r**2)) if self.over_norms else r
 

@@ -84,7 +84,7 @@ class Feature:
         """Return the equations (k, 3 or 1), of the touches' (K, 3), that the contrasts replace."""
         return equations[self.places.shape[1] :, : len(self.shown)]
 
-    def seen(self, values: Array) -> Array:
+    def observed(self, values: Array) -> Array:
         """Return the components (K, 3, c) of values of the positions that a touch measures."""
         components = np.zeros_like(values)
         components[:, : len(self.shown)] = self.shown @ values
@@ -93,7 +93,7 @@ class Feature:
     def slopes(self, values: Array) -> Array:
         """Return the changes (K, 3, c) of the touches' residuals for changes (K, 3, c) of the positions."""
         moved = self.moved(values)
-        slopes = self.seen(values - moved.centre)
+        slopes = self.observed(values - moved.centre)
         q = self.places[:, 1:] @ self.across[: self.places.shape[1] - 1] + np.outer(self.height, self.normal)
         slopes[:, 0] += q @ moved.normal
         return slopes
@@ -210,7 +210,7 @@ class Touches:
         left = residual.copy()
         slopes = jacobian.copy()
         for thing, index in zip(where, self.rows, strict=True):
-            left[index] = unit * thing.seen((residual[index] + thing.centre)[:, :, None])[:, :, 0]
+            left[index] = unit * thing.observed((residual[index] + thing.centre)[:, :, None])[:, :, 0]
             slopes[index] = unit * thing.slopes(jacobian[index])
         if self.spread > CLOSE:
             every = np.concatenate(self.rows)

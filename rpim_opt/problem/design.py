@@ -311,7 +311,7 @@ def observe(problem: Source) -> Observability:
     x = np.zeros(len(free))
     model = problem.linearize(x)
     s = model.svd[1]
-    A, rank = model.triangle[: len(x), : len(x)], model.rank
+    A, rank = model.qr_factor[: len(x), : len(x)], model.rank
     length = np.linalg.norm(A, axis=0)
     blind = length <= 1e-10 * length.max()
     units = np.where(np.array(free.dimensions) == "length", 1.0, 1e3)  # mm per mm, mm per rad

@@ -18,7 +18,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.misreadings import BETTER, RARE, WRONG, better_reading, coupling, signs
+from rpim_opt.problem.misreadings import BETTER, RARE, WRONG, better_interpretation, coupling, signs
 from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import SHIFTED, CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import transformed
@@ -380,7 +380,7 @@ def computed_columns(problem: CalibrationProblem) -> Iterator[str]:
     A coordinate of a point in any frame, of any reflector, is linear in position and rotation of the nominal flange.
     """
     points = points_of(problem)
-    if points is None or points.seen or len(points.row) < 2 * LINEAR or len(points.tools) > 1:
+    if points is None or points.by_camera or len(points.row) < 2 * LINEAR or len(points.tools) > 1:
         return
     T = forward_kinematics(points.robot, points.q)
     X = np.column_stack([T[:, :3, 3], T[:, :3, :3].reshape(len(T), 9), np.ones(len(T))])
@@ -517,7 +517,7 @@ def _values_that_fit(points: Points, joint: int, known: Fit | None = None) -> Ar
     return q
 
 
-def other_readings(problem: CalibrationProblem, most: float = np.inf) -> list[str]:
+def better_interpretations(problem: CalibrationProblem, most: float = np.inf) -> list[str]:
     """Return what explains a table better than it is stated: another place or interpretation of some rows, or of all.
 
     Where half of the rows agree with the nominal robot, another interpretation is sought of the others first. One of
@@ -528,7 +528,7 @@ def other_readings(problem: CalibrationProblem, most: float = np.inf) -> list[st
         return []
 
     def of_all() -> Iterator[str]:
-        better = better_reading(problem)
+        better = better_interpretation(problem)
         if better is not None and better.left <= max(most, REACH * points.extent):  # the arm's unit may be wrong
             yield better.sentence
 
@@ -630,7 +630,7 @@ def other_rows(problem: CalibrationProblem) -> Iterator[str]:
             if odd:
                 yield from odd
                 return
-        better = better_reading(problem.on(problem.data.take(some.row)), whole=False)
+        better = better_interpretation(problem.on(problem.data.take(some.row)), whole=False)
         if better is not None:
             where = where or _rows(problem.data, some.row, "fits otherwise:", "fit otherwise:")
             yield f"{where} {better.sentence}"
@@ -1016,8 +1016,8 @@ def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         rows = joined([problem.data.label[i] for i in np.flatnonzero(~kept)])  # all, as they are to be left out
         yield (
             f"residuals of rows {rows} are {three_digits(times)} times those of the others, which agree with the "
-            "stated noise: was the reflector loose in its nest, or the arm not at rest? Measure them again, or leave them "
-            "out ([exclude])."
+            "stated noise: was the reflector loose in its nest, or the arm not at rest? Measure them again, or leave "
+            "them out ([exclude])."
         )
 
 

@@ -37,7 +37,7 @@ class LinearModel(Brief):
     >>> import rpim_opt as ro
     >>> problem = ro.load("paper_arm").problem
     >>> model = problem.linearize(np.zeros(len(problem.parameters.free)))
-    >>> model.A.shape, model.equations, model.rank, model.triangle.shape
+    >>> model.A.shape, model.equations, model.rank, model.qr_factor.shape
     ((27, 26), 27, 20, (27, 27))
     """
 
@@ -61,13 +61,13 @@ class LinearModel(Brief):
     @cached_property
     def svd(self) -> tuple[Array, Array, Array]:
         """U'b (n,), s (n,), V' (n, n) of A = U diag(s) V'; s below `RANK_TOLERANCE` times the largest are zero."""
-        n, R = self.A.shape[1], self.triangle
+        n, R = self.A.shape[1], self.qr_factor
         U, s, Vt = svd(R[:n, :n])
         s = np.where(s > RANK_TOLERANCE * s[0], s, 0.0)
         return U.T @ R[:n, n], s, Vt
 
     @cached_property
-    def triangle(self) -> Array:
+    def qr_factor(self) -> Array:
         """QR factor R (n+1, n+1) of [A b], upper triangular: |A z - b| = |R [z; -1]| for every z."""
         return reduced_rows(np.column_stack([self.A, self.b]))
 

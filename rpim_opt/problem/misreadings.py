@@ -129,7 +129,7 @@ def pose_misfit(robot: Robot, data: Dataset, tool: Array | None = None) -> float
 def _readings(points: Points) -> list[Misreading]:
     """Return all single mistakes that are looked for."""
     readings = [*_of_joints(points.robot), *_of_rows(len(points.row), points.robot)]
-    if points.seen:
+    if points.by_camera:
         remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or vice versa'
         return [*readings, Misreading("the camera and the board exchanged", remedy, _inverted)]
     if points.lengths:
@@ -440,7 +440,7 @@ def _other_robots(points: Points) -> Iterator[Misreading]:
 # Which of these fits
 
 
-def better_reading(problem: CalibrationProblem, whole: bool = True) -> Better | None:
+def better_interpretation(problem: CalibrationProblem, whole: bool = True) -> Better | None:
     """Return the interpretation that fits far better than the table as written, or None.
 
     Single mistakes are tried first, then a second and a third one behind the best of them; where the nominal model
@@ -459,10 +459,10 @@ def better_reading(problem: CalibrationProblem, whole: bool = True) -> Better | 
         return None
     chain, left = _mistakes(points, present)
     for further in ((_factors, _other_robots), (_orders,)):
-        if left >= BETTER * present and present > WRONG and not points.seen and whole:
+        if left >= BETTER * present and present > WRONG and not points.by_camera and whole:
             first = [each for readings in further for each in readings(points)]
             chain, left = _chain(points, present, first, BETTER * present, 2)
-    fits = left < BETTER * present and (left <= LEFT or points.seen)
+    fits = left < BETTER * present and (left <= LEFT or points.by_camera)
     if fits:  # F test of two fits with the same spare equations, times the choices: few rows fit some of them well
         equations = points.y.size if points.turns is None else 2 * points.y.size
         spare = max(equations - len(FRAME) - points.tools.size - max(points.robot.dof - 2, 0), 1)
@@ -471,7 +471,7 @@ def better_reading(problem: CalibrationProblem, whole: bool = True) -> Better | 
         return _of_mapping(mapping)
     if fits:
         return _told(points, chain, present, left)
-    if points.seen or not whole:
+    if points.by_camera or not whole:
         return None
     behind = _mapping_behind(points) if present > WRONG and not points.lengths else None
     return behind or sibling(problem)
@@ -525,7 +525,7 @@ def _mapping_behind(points: Points) -> Better | None:
 def sibling(problem: CalibrationProblem) -> Better | None:
     """Return the ready robot of nearly the same parameters that fits far better, a UR10e for a UR10; or None."""
     points = points_of(problem) or lengths_of(problem)
-    if points is None or points.seen:
+    if points is None or points.by_camera:
         return None
     own = misfit(points)
     for each in _other_robots(points):
@@ -547,8 +547,8 @@ def _mistakes(points: Points, stated: float) -> tuple[list[Misreading], float]:
     """Return the best of up to three mistakes together: each time the best one, else two of which none is the best."""
     readings = _readings(points)
     enough = min(BETTER * stated, WRONG)
-    chain, best = _chain(points, stated, readings, enough, MISTAKES[points.seen])
-    if stated > WRONG and not points.seen and best >= enough:
+    chain, best = _chain(points, stated, readings, enough, MISTAKES[points.by_camera])
+    if stated > WRONG and not points.by_camera and best >= enough:
         # another unit of lengths alone may be no better, as that of angles beside it is wrong, too
         units = [i for i, each in enumerate(readings) if each.what.startswith("measured lengths a thousand")]
         for i in dict.fromkeys([*units, *np.argsort(_tried(points, readings))[:12].tolist()]):

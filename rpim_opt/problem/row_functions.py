@@ -149,7 +149,7 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
             own[name] = p.value(of_fixture(name, of.fixture))
     known = {name: ca.reshape(symbols[name], -1, points) for name in ("q", "torque") if name in symbols}
     known |= columns_of(symbols)
-    for name in measurement.sees:
+    for name in measurement.depends_on:
         if name not in known:
             where = f"measurement {measurement.name}"
             raise InputError(where, f"data without '{name}', on which it depends", "data that state it in every row")
@@ -285,7 +285,7 @@ def require_same_torques(robot: Robot, parameters: Parameters, before: bool, now
 
 def repeated(block: Block) -> np.ndarray:
     """Return the number (N,) of what rows measured: the same where joint values and a model's own columns are."""
-    seen = [block.columns[name][:, None] for name in block.measurement.sees if name in block.columns]
+    seen = [block.columns[name][:, None] for name in block.measurement.depends_on if name in block.columns]
     same = np.hstack([block.q.reshape(len(block.row), -1), *seen]).round(7)
     return np.unique(same, axis=0, return_inverse=True)[1].ravel()  # a column in NumPy 2.0
 

@@ -273,7 +273,7 @@ def _parameters(content: Content) -> Iterator[Block]:
         half = uncertainty.expanded
         k = f"k = {uncertainty.coverage_factor:.2f}"
         head[4] = f"U ({k})"
-        t = f"Student's t with {result.freedom:.0f} effective degrees of freedom"
+        t = f"Student's t with {result.noise_dof:.0f} effective degrees of freedom"
         note = f"U = k u is the expanded uncertainty ({k}, 95 %, {t}), from measurement noise and prior."
     tolerance = plot.active_tolerance(result)
     at_bound = {each.name for each in result.active_bounds}

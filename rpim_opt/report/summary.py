@@ -161,7 +161,7 @@ def identifiability(result: Calibration) -> str:
     """Return a sentence on the number of identifiable parameter combinations, without coefficients of curves."""
     model = result.program.model
     parameters = ~result.problem.parameters.free.of_curves
-    s = np.linalg.svd(model.triangle[:-1, :-1][:, parameters], compute_uv=False)
+    s = np.linalg.svd(model.qr_factor[:-1, :-1][:, parameters], compute_uv=False)
     rank, count = int(np.sum(s > RANK_TOLERANCE * s[0])), int(parameters.sum())
     apart = "" if parameters.all() else ", without the transmission errors of the joints"
     others = " The others enlarge standard deviations of parameters, not those of predicted measurements."

@@ -18,7 +18,7 @@ from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.threads import on_all_cores, one_blas_thread
 from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.calibration.acceptance import accept
-from rpim_opt.calibration.covariance import Spread, noise_covariances, position_noise
+from rpim_opt.calibration.covariance import FitCovariance, noise_covariances, position_noise
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
@@ -130,7 +130,7 @@ class Compensation:
             whole, left = (f"{1e3 * EXPANDED * each:.4f} mm" for each in (rms(self.std), self.std_after_motion))
             lines.append(
                 f"Most of the expanded uncertainty (k = 2), {whole} RMS, is a common displacement of all targets: the "
-                f"data hardly determine the base frame. Relative to each other the targets have {left} RMS."
+                f"data hardly determine the base frame. Relative to each other it is {left} RMS."
             )
         at_fault = {UNREACHABLE: " in the robot's base frame", ABOVE: f" of {1e3 * self.limit:g} mm"}
         for status, where in {"limited": "", "near singular": "", **at_fault}.items():
@@ -369,7 +369,7 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
     if orientation is None and cell.kind is pose:
         turns = [(cell.norms(each.before)[1], cell.uncertainty(each.commands, each.targets)[1]) for each in parts]
         turn, of_turn = (1e3 * np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in zip(*turns, strict=True))
-        if turn < of_turn < np.inf or cell.spread is None:
+        if turn < of_turn < np.inf or cell.fit_covariance is None:
             known = "its uncertainty is unknown"
             if np.isfinite(of_turn):
                 known = f"its correction, {turn:.2f} mrad, would be smaller than its standard uncertainty, "
@@ -450,7 +450,7 @@ class _Cell(NamedTuple):
     problem: CalibrationProblem  # with the robot's data
     x: Array  # deviations (n,) of its identified parameters
     own: np.ndarray  # (n,) their places among all identified ones
-    spread: Spread | None  # what is known of these
+    fit_covariance: FitCovariance | None  # what is known of these
     marker: str
     noise: Array  # covariance (k, k) [SI] of a reading
     level: float  # the noise's variance over that
@@ -510,7 +510,7 @@ class _Cell(NamedTuple):
         return cls(
             robot, kind, Arm.of(robot, nominal, nominal, prefix, np.eye(4), kind, loads),
             Arm.of(robot, identified, nominal, prefix, moved, kind, loads), loads, problem, x[p.identified],
-            own, None if result.no_intervals else result.spread, marker, noise, result.variance_factor, point,
+            own, None if result.no_intervals else result.fit_covariance, marker, noise, result.variance_factor, point,
         )  # fmt: skip
 
     def begun(self, targets: Targets) -> _Begun:
@@ -570,18 +570,18 @@ class _Cell(NamedTuple):
         Of positions, what one motion of all of them leaves, where they are ``moved`` (N, 3) with it.
         """
         N, k = len(q), len(self.kind.components)
-        if self.spread is None:
+        if self.fit_covariance is None:
             return self.norms(np.full((N, k), np.inf))
         loads = targets.torque, targets.payload
         problem = self.problem.measuring(q, self.kind, self.marker, *loads, covariance=self.noise)
-        J = np.zeros((N, k, len(self.spread.z)))
+        J = np.zeros((N, k, len(self.fit_covariance.z)))
         J[:, :, self.own] = problem.jacobian(self.x).reshape(N, k, -1)
         if moved is not None:
             motions = np.concatenate([np.tile(np.eye(3), (N, 1, 1)), np.cross(moved[:, None], np.eye(3))], axis=2)
             Q = np.linalg.qr(motions.reshape(3 * N, 6))[0]
             of_positions = J[:, :3].reshape(3 * N, -1)
             J[:, :3] = (of_positions - Q @ (Q.T @ of_positions)).reshape(N, 3, -1)
-        position_and_turn = (self.spread.of_positions(J[:, i : i + 3]) for i in range(0, k, 3))
+        position_and_turn = (self.fit_covariance.of_positions(J[:, i : i + 3]) for i in range(0, k, 3))
         variance = np.hstack([np.einsum("nkk->nk", C) for C in position_and_turn])
         variance += np.einsum("nkk->nk", noise_covariances(problem, self.level).robot[0])
         return self.norms(np.sqrt(variance))

@@ -197,9 +197,9 @@ def monitor(
     held = held_out_errors(result, data)
     return Monitoring(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
-        allowed=np.sqrt(equations * fdtri(equations, max(result.freedom, 1.0), 1 - level / count)), sums=cusum(deviate),
-        limit=cusum_limit(count, level), drift=_drift(result, problem, own, level), registered=motion,
-        mistake=unregistered(result, data, held)
+        allowed=np.sqrt(equations * fdtri(equations, max(result.noise_dof, 1.0), 1 - level / count)),
+        sums=cusum(deviate), limit=cusum_limit(count, level), drift=_drift(result, problem, own, level),
+        registered=motion, mistake=unregistered(result, data, held)
         or misread(result, data)
         or recalibration.moved_or_changed(result, data, held)[0],
     )  # fmt: skip
@@ -245,7 +245,7 @@ def _innovations(
     for (block, part), V in zip(by_block(problem, np.column_stack([residual, slopes])), readings, strict=True):
         of_rows = zip(part, np.broadcast_to(V, (len(part), *V.shape[1:])), strict=True)
         rows |= zip(block.row.tolist(), of_rows, strict=True)
-    freedom = max(result.freedom, 1.0)
+    freedom = max(result.noise_dof, 1.0)
     sigmas, p_values, degrees = np.zeros(len(rows)), np.full(len(rows), 0.5), np.zeros(len(rows), dtype=int)
     for t, (equations, V) in sorted(rows.items()):
         r, A = equations[:, 0], equations[:, 1:]

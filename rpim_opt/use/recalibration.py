@@ -530,7 +530,7 @@ class Misfit:
 
     def __init__(self, result: Calibration, model: LinearModel, prior: Quadratic, reset: Sequence[int] = ()) -> None:
         sigma = np.sqrt(result.variance_factor)
-        self.freedom = max(result.freedom, 1.0)
+        self.noise_dof = max(result.noise_dof, 1.0)
         self.m = len(model.b)
         self.A = model.A / sigma
         self.L = prior.matrix / sigma
@@ -562,7 +562,7 @@ class Misfit:
         return cause._replace(gain=gain, p_value=self._p_value(gain, int(observed.sum())))
 
     def _p_value(self, squares: float, m: int) -> float:
-        return float(fdtrc(m, self.freedom, squares / m))
+        return float(fdtrc(m, self.noise_dof, squares / m))
 
 
 def candidates(free: Parameters, data: Dataset, reset: Sequence[str] = ()) -> list[Cause]:

@@ -39,7 +39,8 @@ def in_session(result: Calibration, robot: str = "") -> Calibration:
     views = [replace(result, problem=replace(problem, session=name)) for name in names]
     if result.no_intervals:
         return views[0]
-    squares = [np.trace(result.spread.of_positions(_slopes(view, robot)), axis1=1, axis2=2).sum() for view in views]
+    fit = result.fit_covariance
+    squares = [np.trace(fit.of_positions(_slopes(view, robot)), axis1=1, axis2=2).sum() for view in views]
     return views[int(np.argmin(squares))]
 
 
@@ -116,7 +117,7 @@ def session_notes(result: Calibration, robot: str = "") -> list[str]:
     for i, name in enumerate(names[1:FEW] if not result.no_intervals else (), start=1):
         M = base_frame(result, robot) @ np.linalg.inv(base_frame(result, robot, name))
         there = replace(result, problem=replace(result.problem, session=name))
-        apart = result.spread.of_positions(_slopes(result, robot) - M[:3, :3] @ _slopes(there, robot))
+        apart = result.fit_covariance.of_positions(_slopes(result, robot) - M[:3, :3] @ _slopes(there, robot))
         U = 2e3 * np.sqrt(np.trace(apart, axis1=1, axis2=2).max())
         listed[i] += f" (positions there relative to '{here}': U, k = 2, at most {U:.3g} mm where it was measured)"
     more = f"; {len(names) - FEW} more in the result" if len(names) > FEW else ""

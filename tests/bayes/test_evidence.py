@@ -348,7 +348,7 @@ def test_a_gibbs_sampler_agrees() -> None:
     for stack in result.problem.stacks(False):
         for index, block in zip(stack.index, stack.covariance(result.problem.repeatability), strict=True):
             R[np.ix_(index, index)] = block
-    sizes = np.append([size.value for size in result.learned.sizes.values()], 1.0)
+    sizes = np.append([size.value for size in result.learned.scales.values()], 1.0)
     size = sizes[stated.group]
     W = np.linalg.inv(np.linalg.cholesky(R))
     A, b = W @ J, W @ y

@@ -118,9 +118,9 @@ def test_sizes_come_out_as_they_were_put_in() -> None:
         result = ro.calibrate(measured(POSITION, drawn(seed), seed, repeatability=8e-5))
         learned = result.learned
         assert learned is not None
-        sizes = [learned.sizes[name].value / 0.5 for name in ("angles", "lengths", "joint offsets")]
+        sizes = [learned.scales[name].value / 0.5 for name in ("angles", "lengths", "joint offsets")]
         logs.append([*sizes, learned.noise["position"].value / 8e-5])
-        base.append(learned.sizes["base"].value)
+        base.append(learned.scales["base"].value)
     # t_3 tails around normal draws: its size comes out somewhat smaller; frames take up some of the lengths
     assert np.exp(np.mean(np.log(logs), axis=0)) == pytest.approx([0.8, 0.6, 0.8, 1.0], rel=0.2)
     # drawn at a twentieth; six deviations pull it so far from one, which is expected
@@ -412,7 +412,9 @@ def test_the_covariance_knows_how_deviations_follow_sizes_and_what_tails_leave_o
     learned = result.learned
     assert learned is not None
     estimator = Estimator(ro.bayes.Prior(), tuple(learned.noise))
-    fit = estimator.fit(few, result.x, np.log([s.value for s in (*learned.sizes.values(), *learned.noise.values())]), 1)
+    fit = estimator.fit(
+        few, result.x, np.log([s.value for s in (*learned.scales.values(), *learned.noise.values())]), 1
+    )
     evidence, logs = fit.evidence, fit.point.logs
     step = 0.01
     ends = [[evidence.at(logs + side * e).z for side in (-1, 1)] for e in step * np.eye(len(logs))]
@@ -422,7 +424,7 @@ def test_the_covariance_knows_how_deviations_follow_sizes_and_what_tails_leave_o
     own = np.diag(J @ learned.covariance @ J.T)
     assert np.sum(followed**2, axis=1) == pytest.approx(own, rel=0.1, abs=0.02 * np.diag(result.covariance).min())
 
-    plain = replace(ro.calibrate(result.problem, ro.tikhonov, 1.0).spread, level=1.0)
+    plain = replace(ro.calibrate(result.problem, ro.tikhonov, 1.0).fit_covariance, level=1.0)
     added = np.diag(result.covariance - plain.covariance)
     assert added == pytest.approx(np.sum(followed**2, axis=1) + np.sum(tails**2, axis=1), rel=1e-3, abs=1e-12)
     assert np.median(np.sqrt(np.diag(result.covariance) / np.diag(plain.covariance))) > 1.02
@@ -461,6 +463,6 @@ def test_a_reading_repeatability_as_surely_as_its_noise_is_known() -> None:
     problem = measured(POSITION, drawn(3), 3, repeatability=3e-4)
     learned = ro.calibrate(problem).learned
     assert learned is not None
-    names = list(learned.sizes)
+    names = list(learned.scales)
     by_noise = 2 * learned.covariance[len(names), len(names)] ** 0.5
-    assert learned.freedom == pytest.approx(2 / by_noise**2, rel=0.1)
+    assert learned.noise_dof == pytest.approx(2 / by_noise**2, rel=0.1)

@@ -35,8 +35,8 @@ def result_of(formulation: ro.Formulation, linear: LinearModel, weight: float, n
     """What a prior needs of a calibration whose model is linear."""
     program = ro.convex.pose(formulation, linear)
     x = program.solve(weight).z * FREE.scale
-    spread = SimpleNamespace(linear=linear, weight=weight, noise_variance=noise, factor=1.0, drift=None)
-    return SimpleNamespace(problem=PROBLEM, x=x, program=program, spread=spread, learned=None)
+    fit = SimpleNamespace(linear=linear, weight=weight, noise_variance=noise, factor=1.0, drift=None)
+    return SimpleNamespace(problem=PROBLEM, x=x, program=program, fit_covariance=fit, learned=None)
 
 
 def then(prior: Prior, linear: LinearModel) -> np.ndarray:
@@ -72,7 +72,7 @@ def test_what_neither_data_nor_penalty_saw_stays_open() -> None:
 
 def test_what_was_set_up_anew_is_left_out_whatever_it_was() -> None:
     result = result_of(ro.tikhonov, model(1), WEIGHT)
-    covariance = np.linalg.inv(result.spread.linear.A.T @ result.spread.linear.A + WEIGHT * np.eye(n))
+    covariance = np.linalg.inv(result.fit_covariance.linear.A.T @ result.fit_covariance.linear.A + WEIGHT * np.eye(n))
     stated = Prior.from_result(result, without=("base_*",)).stated(PROBLEM.parameters)
     kept = np.array([not name.startswith("base_") for name in FREE.names])
     precision = stated.rows.T @ stated.rows
@@ -101,7 +101,9 @@ def test_it_is_as_wide_as_the_result_says() -> None:
     stated = Prior.from_result(result).stated(PROBLEM.parameters)
     covariance = np.linalg.inv(stated.rows.T @ stated.rows) * np.outer(FREE.scale, FREE.scale)
     assert np.diag(covariance) == pytest.approx(np.diag(result.covariance), rel=1e-5)
-    held = result.spread.noise + result.spread.form.prior(1.0) * np.outer(*2 * [result.problem.parameters.free.scale])
+    held = result.fit_covariance.noise + result.fit_covariance.form.prior(1.0) * np.outer(
+        *2 * [result.problem.parameters.free.scale]
+    )
     assert np.median(np.diag(covariance) / np.diag(held)) > 1.3  # eight configurations leave much to the tails
 
 
@@ -150,8 +152,8 @@ def test_two_campaigns_of_one_arm_end_where_one_with_all_rows_does() -> None:
     sd = np.sqrt(np.diag(wanted.covariance))
     assert result.converged
     assert np.max(np.abs(result.x - wanted.x) / sd) < 0.05  # the model bends a little between the two
-    assert np.sqrt(np.diag(result.covariance / result.spread.noise_variance)) == pytest.approx(
-        np.sqrt(np.diag(wanted.covariance / wanted.spread.noise_variance)), rel=0.02
+    assert np.sqrt(np.diag(result.covariance / result.fit_covariance.noise_variance)) == pytest.approx(
+        np.sqrt(np.diag(wanted.covariance / wanted.fit_covariance.noise_variance)), rel=0.02
     )
 
 

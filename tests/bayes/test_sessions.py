@@ -96,9 +96,9 @@ def test_the_evidence_takes_sessions_and_says_how_they_differ(automatic: ro.Cali
     assert learned.extensions == ("sessions",)
     assert learned.gain("sessions") > 100
     for kind, true in (("shifts", SHIFT), ("turns", TURN)):  # twelve draws each
-        size = learned.sizes[f"sessions' {kind}"]
-        assert abs(np.log(1e-4 * size.value / true)) < 2.5 * size.spread
-        assert 0.15 < size.spread < 0.5  # of twelve numbers 1 / sqrt(24) = 0.2
+        size = learned.scales[f"sessions' {kind}"]
+        assert abs(np.log(1e-4 * size.value / true)) < 2.5 * size.log_std
+        assert 0.15 < size.log_std < 0.5  # of twelve numbers 1 / sqrt(24) = 0.2
     assert "Session offsets (1 sigma): 0." in str(automatic)
 
 
@@ -205,7 +205,7 @@ def test_sessions_come_back_from_a_file(automatic: ro.Calibration, tmp_path: Pat
     assert np.allclose(again.errors(), automatic.errors(), atol=1e-12)
     assert again.learned is not None
     assert automatic.learned is not None
-    assert again.learned.sizes == automatic.learned.sizes
+    assert again.learned.scales == automatic.learned.scales
 
 
 def test_an_update_in_a_new_session_keeps_the_robot(arm: ro.study.SimulatedArm, automatic: ro.Calibration) -> None:

@@ -91,7 +91,7 @@ def test_sizes_are_learned_from_parts_as_from_the_whole() -> None:
     parts = ro.calibrate(in_parts())
     assert parts.learned is not None
     assert whole.learned is not None
-    assert parts.learned.sizes.keys() == whole.learned.sizes.keys()
+    assert parts.learned.scales.keys() == whole.learned.scales.keys()
     assert parts.x == pytest.approx(whole.x, abs=2e-5)
 
 

@@ -16,7 +16,7 @@ from rpim_opt.calibration import inspect, likely_causes
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.problem import misreadings
 from rpim_opt.problem.diagnosis import left_out_together, other_rows, rows_without_values, two_positions
-from rpim_opt.problem.misreadings import better_reading
+from rpim_opt.problem.misreadings import better_interpretation
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.library import READY
@@ -898,7 +898,7 @@ def test_rotation_vectors_and_orientations_of_other_rows_are_named(change, named
         quaternions = change(Rotation.from_quat(y[:, [4, 5, 6, 3]])).as_quat()
         return np.column_stack([y[:, :3], quaternions[:, [3, 0, 1, 2]]])
 
-    assert named in better_reading(values(turned)(ro.load("pose").problem)).sentence
+    assert named in better_interpretation(values(turned)(ro.load("pose").problem)).sentence
 
 
 def test_an_arm_of_poor_repeatability_with_a_joint_on_one_side_is_not_flagged() -> None:
@@ -928,7 +928,7 @@ def test_stroke_and_roll_exchanged_are_named() -> None:
 def test_a_stroke_in_inches_is_named() -> None:
     problem = ro.load("scara").problem
     inches = np.where(np.array(problem.robot.joint_dimensions) == "length", 1 / 25.4, 1.0)
-    assert "values of linear joints in inches" in better_reading(joints(lambda q: q * inches)(problem)).sentence
+    assert "values of linear joints in inches" in better_interpretation(joints(lambda q: q * inches)(problem)).sentence
 
 
 @pytest.mark.slow
@@ -1071,14 +1071,14 @@ def angles_of(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     ],
 )
 def test_increments_and_angles_are_named(wrong, named: str) -> None:
-    assert named in better_reading(wrong(simulated_arm("ur5e"))).sentence
+    assert named in better_interpretation(wrong(simulated_arm("ur5e"))).sentence
 
 
 def test_joints_are_named_as_in_their_file() -> None:
     """With a rail before the arm joint 5 was taken for the file's `joint_a5`, which is number 6."""
     problem = joints(lambda q: q[..., [2, 1, 0, 3, 4, 5]])(simulated_arm("ur5e"))
     problem = replace(problem, robots=replace(problem.robot, joint_names=tuple("ABCDEF")))
-    assert "exchange the columns of joints 1 (A) and 3 (C)" in better_reading(problem).sentence
+    assert "exchange the columns of joints 1 (A) and 3 (C)" in better_interpretation(problem).sentence
 
 
 def test_a_coordinate_that_was_computed_is_named() -> None:

@@ -111,7 +111,7 @@ def test_widths_are_those_of_repeated_measurements(constraint: Any) -> None:
         for _ in range(2000)
     ])  # fmt: skip
     measured = draws.std(axis=0) / small
-    expected = np.sqrt(np.diag(result.spread.form.noise(1.0)))
+    expected = np.sqrt(np.diag(result.fit_covariance.form.noise(1.0)))
     assert measured == pytest.approx(expected, rel=0.06, abs=1e-5 * expected.max())
 
 

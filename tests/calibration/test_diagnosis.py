@@ -146,12 +146,12 @@ def test_the_factor_of_a_loss_is_its_weight_against_squares() -> None:
     problem, _ = simulated(noise=5e-5)
     tripled = ro.Formulation("tripled", loss=lambda r: 3 * cp.sum_squares(r), penalty=cp.sum_squares)
     results = {each.name: ro.calibrate(problem, each, 1.0) for each in (ro.tikhonov, tripled, ro.robust)}
-    assert results["Tikhonov"].spread.linear.factor == 1.0
-    assert results["tripled"].spread.linear.factor == pytest.approx(3.0, rel=1e-9)
+    assert results["Tikhonov"].fit_covariance.linear.factor == 1.0
+    assert results["tripled"].fit_covariance.linear.factor == pytest.approx(3.0, rel=1e-9)
     robust = results["Huber"]
     inliers = robust.program.inliers(robust.z)
     assert inliers is not None
-    assert robust.spread.linear.factor == inliers.factor
+    assert robust.fit_covariance.linear.factor == inliers.factor
 
 
 @pytest.mark.parametrize("name", ["mixed", "markers", "pose"])

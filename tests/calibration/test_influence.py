@@ -40,7 +40,7 @@ def test_changes_are_those_of_leverage(name: str) -> None:
     result = ro.calibrate(ro.load(name).problem, ro.tikhonov, weight=1.0)
     found = influence(result)
     assert len(found.label) == len(np.unique(result.problem.data.configuration))
-    assert found.leverage.sum() == pytest.approx(result.spread.degrees_of_freedom, rel=1e-9)
+    assert found.leverage.sum() == pytest.approx(result.fit_covariance.degrees_of_freedom, rel=1e-9)
     assert (found.weight == 1).all()
     for k in range(0, len(found.label), 7):
         assert close(found, k, left_out(result, found.configuration[k]))
@@ -63,7 +63,7 @@ def test_cooks_distance_is_how_far_predictions_move() -> None:
     A = result.program.model.A
     for k in (0, 11):
         moved = A @ (found.change[k] / result.problem.parameters.free.scale)
-        expected = moved @ moved / (result.spread.degrees_of_freedom * result.spread.noise_variance)
+        expected = moved @ moved / (result.fit_covariance.degrees_of_freedom * result.fit_covariance.noise_variance)
         assert found.cook[k] == pytest.approx(expected, rel=1e-8)
 
 

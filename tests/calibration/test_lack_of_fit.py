@@ -82,7 +82,7 @@ def test_division_adds_up_to_what_the_model_without_the_extension_leaves():
     total = found.instrument**2 + found.robot**2 + found.repeatable**2
     assert found.repeatable**2 / total == pytest.approx(found.share, rel=1e-9)
     # of 75 equations 2 in 5 serve the parameters
-    assert found.left * np.sqrt(found.equations / found.spare) == pytest.approx(np.sqrt(total), rel=0.2)
+    assert found.left * np.sqrt(found.equations / found.residual_dof) == pytest.approx(np.sqrt(total), rel=0.2)
 
 
 def test_model_that_has_gravity_says_so():
@@ -143,7 +143,7 @@ def test_repeated_readings_tell_repeatability_from_what_comes_again():
 
 def test_too_few_equations_are_not_judged():
     found = lack_of_fit(learned(8, n=9, compliance=BENT))
-    assert found.spare < FEWEST
+    assert found.residual_dof < FEWEST
     assert not found.alarming
     assert "too few to separate" in str(found)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.bayes.hyperparameters import ExcludedRow, Learned, Size, Trial
+from rpim_opt.bayes.hyperparameters import ExcludedRow, Hyperparameter, Learned, Trial
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, repeatability_bounds
 from rpim_opt.calibration.certificate import Certificate, certified
@@ -63,7 +63,7 @@ def test_a_share_of_repeatability_that_is_not_known_is_zero() -> None:
 
 # --- what is left --------------------------------------------------------------------------------------------------
 
-PLAIN = {"configurations": 60, "equations": 180, "spare": 150.0, "dimension": "length"}
+PLAIN = {"configurations": 60, "equations": 180, "residual_dof": 150.0, "dimension": "length"}
 
 LACKING = {"missing": ("gravity",), "parameters": ("compliance?",)}
 
@@ -139,9 +139,11 @@ def test_errors_without_any_size_are_not_alike() -> None:
 # --- what was learned ----------------------------------------------------------------------------------------------
 
 
-def learned(sizes: Mapping[str, Size] | None = None, noise: Mapping[str, Size] | None = None, **more: Any) -> Learned:
+def learned(
+    sizes: Mapping[str, Hyperparameter] | None = None, noise: Mapping[str, Hyperparameter] | None = None, **more: Any
+) -> Learned:
     stated: dict[str, Any] = {
-        "local": np.ones(2), "trials": (), "value": 0.0, "freedom": 10.0, "left_out": (),
+        "local": np.ones(2), "trials": (), "value": 0.0, "noise_dof": 10.0, "left_out": (),
         "covariance": np.eye(1), "stated": np.ones(2), "drift": np.zeros((2, 1)), **more,
     }  # fmt: skip
     return Learned(sizes or {}, noise or {}, **stated)
@@ -155,7 +157,10 @@ def test_what_was_learned_is_said_and_nothing_else() -> None:
     assert said(learned()) == []
     assert learned().extensions == ()
     assert learned().gain("gravity") is None
-    sized = learned({"lengths": Size(2.0, 0.1), "angles": Size(1.0, 0.1)}, {"position": Size(5e-5, 0.1)})
+    sized = learned(
+        {"lengths": Hyperparameter(2.0, 0.1), "angles": Hyperparameter(1.0, 0.1)},
+        {"position": Hyperparameter(5e-5, 0.1)},
+    )
     assert said(sized) == [
         "Estimated prior scale: lengths 2 x the stated one (95 % CI 1.6 to 2.4) and angles 1 x (95 % CI 0.82 to 1.2).",
         "Robot repeatability (1 sigma): 0.05 mm (95 % CI 0.041 to 0.061) in position along each axis.",
@@ -164,11 +169,11 @@ def test_what_was_learned_is_said_and_nothing_else() -> None:
 
 def test_parts_of_the_repeatability_that_are_not_worth_a_word() -> None:
     """Beside the largest; a size that is hardly known has an upper end."""
-    only = said(learned(noise={"position": Size(1e-3, 0.1), "joint": Size(1e-6, 0.1)}))
+    only = said(learned(noise={"position": Hyperparameter(1e-3, 0.1), "joint": Hyperparameter(1e-6, 0.1)}))
     assert len(only) == 1
     assert "joint" not in only[0]
     assert "mm" in only[0]
-    vague = said(learned(noise={"position": Size(1e-3, 0.6)}))[0]
+    vague = said(learned(noise={"position": Hyperparameter(1e-3, 0.6)}))[0]
     assert "at most 2.7 mm (95 % confidence)" in vague
 
 

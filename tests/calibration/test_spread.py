@@ -24,23 +24,27 @@ SCALE = PROBLEM.parameters.free.scale
 
 
 def test_covariances_are_their_formulas() -> None:
-    m = RESULT.spread.linear
+    m = RESULT.fit_covariance.linear
     inverse = np.linalg.inv(m.A.T @ m.A + WEIGHT * np.eye(len(SCALE)))
     freedom = len(m.b) - np.trace(m.A @ inverse @ m.A.T)
     variance = np.sum((m.A @ RESULT.z - m.b) ** 2) / freedom
-    assert RESULT.spread.noise_variance == pytest.approx(variance, rel=1e-9)
-    assert RESULT.spread.degrees_of_freedom == pytest.approx(len(m.b) - freedom, rel=1e-9)
-    assert RESULT.freedom == pytest.approx(freedom, rel=1e-9)
+    assert RESULT.fit_covariance.noise_variance == pytest.approx(variance, rel=1e-9)
+    assert RESULT.fit_covariance.degrees_of_freedom == pytest.approx(len(m.b) - freedom, rel=1e-9)
+    assert RESULT.noise_dof == pytest.approx(freedom, rel=1e-9)
     units = np.outer(SCALE, SCALE)
     assert RESULT.covariance / units == pytest.approx(variance * inverse, rel=1e-6, abs=1e-11)
-    assert RESULT.spread.noise / units == pytest.approx(variance * inverse @ m.A.T @ m.A @ inverse, rel=1e-6, abs=1e-11)
-    assert RESULT.spread.prior / units == pytest.approx(variance * WEIGHT * inverse @ inverse, rel=1e-6, abs=1e-11)
+    assert RESULT.fit_covariance.noise / units == pytest.approx(
+        variance * inverse @ m.A.T @ m.A @ inverse, rel=1e-6, abs=1e-11
+    )
+    assert RESULT.fit_covariance.prior / units == pytest.approx(
+        variance * WEIGHT * inverse @ inverse, rel=1e-6, abs=1e-11
+    )
 
 
 def test_intervals_are_students() -> None:
     for confidence in (0.5, 0.95, 0.99):
         u = Uncertainty(RESULT, confidence)
-        assert u.coverage_factor == pytest.approx(student.ppf((1 + confidence) / 2, RESULT.freedom), rel=1e-9)
+        assert u.coverage_factor == pytest.approx(student.ppf((1 + confidence) / 2, RESULT.noise_dof), rel=1e-9)
         half = u.coverage_factor * np.sqrt(np.diag(RESULT.covariance))
         assert u.expanded == pytest.approx(half, rel=1e-9, abs=1e-12)
     for wrong in (0.0, 1.0, -0.5, 95.0):
@@ -50,8 +54,8 @@ def test_intervals_are_students() -> None:
 
 def stand_in(equations: float, dof: float, variance: float) -> Uncertainty:
     result: Any = SimpleNamespace(
-        spread=SimpleNamespace(spare=equations - dof),
-        freedom=max(equations - dof, 0.0),
+        fit_covariance=SimpleNamespace(residual_dof=equations - dof),
+        noise_dof=max(equations - dof, 0.0),
         noise_test=lambda: noise_test(variance * (equations - dof), equations - dof),
     )
     return Uncertainty(result)
@@ -91,20 +95,20 @@ def test_the_noise_is_as_declared_in_99_of_100_cases() -> None:
 @pytest.mark.parametrize(("left", "tells"), [(0.0, False), (0.9, False), (1.0, True), (1.5, True)])
 def test_what_few_equations_tell(left: float, tells: bool) -> None:
     u = stand_in(20, 20.0 - left, 1.0)
-    assert u.result.freedom == pytest.approx(left, abs=1e-12)
+    assert u.result.noise_dof == pytest.approx(left, abs=1e-12)
     test = u.result.noise_test()
     assert ("No degrees of freedom remain" in test.verdict) != tells
     if not tells:
         assert (test.ratio, test.probability) == (1.0, 1.0)
     assert u.coverage_factor == pytest.approx(student.ppf(0.975, max(left, 1.0)), rel=1e-12)
-    assert stand_in(20, 21.0, 1.0).result.freedom == 0.0
+    assert stand_in(20, 21.0, 1.0).result.noise_dof == 0.0
 
 
 def test_without_equations_left_over_the_noise_is_the_declared() -> None:
     few, _ = simulated(("a2", "theta1", "d5"), noise=5e-5, configurations=1)
     exact = ro.calibrate(few, ro.least_squares)
-    assert exact.spread.linear.equations == 3
-    assert exact.spread.noise_variance == 1.0
+    assert exact.fit_covariance.linear.equations == 3
+    assert exact.fit_covariance.noise_variance == 1.0
 
 
 def test_what_nothing_decides_is_infinite_and_moves_what_it_moves() -> None:
@@ -121,13 +125,13 @@ def test_what_nothing_decides_is_infinite_and_moves_what_it_moves() -> None:
     J = np.zeros((2, 3, 3))
     J[0, 0, names.index("theta1")] = 1.0  # what one of the two moves alone is not known
     J[1, 0, names.index("a2")] = 1.0
-    found = result.spread.of_positions(J)
+    found = result.fit_covariance.of_positions(J)
     if np.isinf(variances["theta1"]):
         assert np.isinf(found[0, 0, 0])
         assert np.isfinite(found[0, 1, 1])
     assert found[1, 0, 0] == pytest.approx(variances["a2"], rel=1e-9)
     for unit in (1e-7, 1e7):  # metres or anything else
-        assert (np.isinf(result.spread.of_positions(unit * J)) == np.isinf(found)).all()
+        assert (np.isinf(result.fit_covariance.of_positions(unit * J)) == np.isinf(found)).all()
 
 
 def test_predictions_propagate() -> None:
@@ -150,7 +154,7 @@ def test_predictions_propagate() -> None:
 def test_draws_repeatability_as_the_noise() -> None:
     draws = ro.calibration.monte_carlo(RESULT, draws=1500, seed=1)
     assert draws.shape == (1500, len(SCALE))
-    stated = np.sqrt(np.diag(RESULT.spread.noise))
+    stated = np.sqrt(np.diag(RESULT.fit_covariance.noise))
     assert draws.std(axis=0) / stated == pytest.approx(np.ones(len(SCALE)), abs=0.08)  # each is told to 1.8 %
     m = RESULT.program.model
     shrunk = RESULT.program.on(m.with_values(m.A @ RESULT.z)).solve(WEIGHT).z * SCALE

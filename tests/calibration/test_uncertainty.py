@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration.covariance import row_freedom
+from rpim_opt.calibration.covariance import row_dof
 from tests.simulate import simulated
 
 Q = np.random.default_rng(77).uniform(-2, 2, (50, 6))
@@ -125,6 +125,6 @@ def test_contributors_to_the_uncertainty_of_a_position_add_up() -> None:
 def test_degrees_of_freedom_of_a_row_are_those_of_the_part_that_it_consists_of() -> None:
     """A variance v of which log(sqrt v) has a standard deviation s has 1 / (2 s^2) of them."""
     V = 1e-8 * np.eye(3)[None]
-    assert row_freedom(100.0, 0.3, V, 0 * V) == pytest.approx([100.0])
-    assert row_freedom(100.0, 0.3, V, V) == pytest.approx([1 / (2 * 0.3**2)])
-    assert row_freedom(100.0, 0.3, 2 * V, V) == pytest.approx([2**2 / (1 / 100.0 + 2 * 0.3**2)])
+    assert row_dof(100.0, 0.3, V, 0 * V) == pytest.approx([100.0])
+    assert row_dof(100.0, 0.3, V, V) == pytest.approx([1 / (2 * 0.3**2)])
+    assert row_dof(100.0, 0.3, 2 * V, V) == pytest.approx([2**2 / (1 / 100.0 + 2 * 0.3**2)])

@@ -97,9 +97,9 @@ def test_a_weighted_squared_loss_tells_the_noise_of_what_it_sums(problem: Any, k
     }[kind]
     result = ro.calibrate(problem, ro.Formulation(kind, lambda r: cp.sum_squares(W @ r), cp.sum_squares), 2.0)
     dof, variance = noise_of(result, W)
-    assert result.spread.linear.equations == len(W)
-    assert result.spread.degrees_of_freedom == pytest.approx(dof, rel=1e-8)
-    assert result.spread.noise_variance * np.mean(np.sum(W**2, axis=1)) == pytest.approx(variance, rel=1e-8)
+    assert result.fit_covariance.linear.equations == len(W)
+    assert result.fit_covariance.degrees_of_freedom == pytest.approx(dof, rel=1e-8)
+    assert result.fit_covariance.noise_variance * np.mean(np.sum(W**2, axis=1)) == pytest.approx(variance, rel=1e-8)
 
 
 def test_leaving_out_configurations_means_so_where_a_loss_mixes_their_equations(problem: Any) -> None:
@@ -111,7 +111,7 @@ def test_leaving_out_configurations_means_so_where_a_loss_mixes_their_equations(
 
 
 def test_a_mean_square_means_the_same_of_measurements_in_parts(problem: Any) -> None:
-    """A triangle has fewer rows than the equations that it stands for."""
+    """A QR factor has fewer rows than the equations that it stands for."""
     halves = [lambda: problem.data.take(range(20)), lambda: problem.data.take(range(20, 40))]
     parts = ro.problem.PartitionedProblem(problem.robot, problem.parameters, halves[0](), halves)
     mean = ro.Formulation("mean square", lambda r: cp.sum_squares(r) / r.size + 1, cp.sum_squares)
@@ -122,10 +122,10 @@ def test_a_mean_square_means_the_same_of_measurements_in_parts(problem: Any) -> 
 
 
 def test_the_norm_of_the_residual_has_a_spread(problem: Any) -> None:
-    """It is posed on a triangle, and keeps equations all the same."""
+    """It is posed on a QR factor, and keeps equations all the same."""
     result = ro.calibrate(problem, ro.Formulation("norm", cp.norm2, cp.sum_squares), 0.1)
     assert result.converged
-    assert 0.8 < result.spread.noise_variance < 1.4
+    assert 0.8 < result.fit_covariance.noise_variance < 1.4
 
 
 @pytest.mark.parametrize("formulation", [ro.tikhonov, ro.robust, ro.lasso], ids=lambda f: f.name)

@@ -32,14 +32,14 @@ def box(lower: Any, upper: Any) -> ro.constraints.Box:
 
 
 def test_a_triangle_stands_for_its_equations_where_the_loss_sees_their_length() -> None:
-    R = MODEL.triangle
-    triangle = LinearModel(R[:, :N], R[:, N], np.zeros(N + 1, dtype=int), MODEL.parameters, stands_for=30)
+    R = MODEL.qr_factor
+    qr_factor = LinearModel(R[:, :N], R[:, N], np.zeros(N + 1, dtype=int), MODEL.parameters, stands_for=30)
     for formulation in (ro.tikhonov, ro.lasso):
-        whole, reduced = (ro.convex.pose(formulation, m).solve(0.7).objective for m in (MODEL, triangle))
+        whole, reduced = (ro.convex.pose(formulation, m).solve(0.7).objective for m in (MODEL, qr_factor))
         assert reduced == pytest.approx(whole, rel=1e-7)
     for formulation in (ro.robust, ro.Formulation("l1", loss=cp.norm1)):
         with pytest.raises(ro.InputError, match="equations in blocks, of which only the QR factor is kept"):
-            ro.convex.pose(formulation, triangle)
+            ro.convex.pose(formulation, qr_factor)
 
 
 def test_norms_of_uneven_configurations_in_any_order() -> None:

@@ -128,7 +128,7 @@ def test_every_minimum_is_that_of_plain_cvxpy(loss: str, penalty: str, constrain
 
 @pytest.mark.parametrize("loss", ["absolute", "quantile", "insensitive", "sum of norms"])
 def test_kinks_of_many_rows_are_those_of_all_rows_in_one_program(monkeypatch: pytest.MonkeyPatch, loss: str) -> None:
-    """From 400 entries on the loss is smoothed, and only rows near a kink are taken as they are."""
+    """From 400 entries on the loss is smoothed, and only rows near a non-smooth point are taken as they are."""
     problem, _ = simulated(configurations=500, noise=1e-4, seed=3)
     model = problem.linearize(np.zeros(34))
     mine = ro.Formulation("mine", penalty=cp.norm1, **LOSSES[loss])

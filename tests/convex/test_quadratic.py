@@ -64,7 +64,7 @@ def test_freedom_noise_and_prior_are_their_definitions(name: str) -> None:
     prior = WEIGHT * inverse @ p.matrix.T @ p.matrix @ inverse
     assert form.prior(WEIGHT) == pytest.approx(prior, rel=1e-7, abs=1e-9)
     assert form.noise(WEIGHT) + form.prior(WEIGHT) == pytest.approx(inverse, rel=1e-7, abs=1e-9)
-    assert form.undecided(WEIGHT).shape == (N, 0)
+    assert form.undetermined(WEIGHT).shape == (N, 0)
 
 
 @pytest.mark.parametrize("name", PENALTIES)
@@ -94,9 +94,9 @@ def test_what_neither_data_nor_penalty_see_is_undecided_and_stays() -> None:
     m, p = unseeing(3, 5), some_free()
     form = ridge(m, p)
     eye = np.eye(N)
-    assert span(form.undecided(WEIGHT)) == pytest.approx(np.diag(eye[3]), abs=1e-9)
-    assert span(form.undecided(0.0)) == pytest.approx(np.diag(eye[3] + eye[5]), abs=1e-9)
-    assert (form.fixed, int(form.seen.sum())) == (1, 9)
+    assert span(form.undetermined(WEIGHT)) == pytest.approx(np.diag(eye[3]), abs=1e-9)
+    assert span(form.undetermined(0.0)) == pytest.approx(np.diag(eye[3] + eye[5]), abs=1e-9)
+    assert (form.unpenalized, int(form.identifiable.sum())) == (1, 9)
     for weight in (1e-3, 7.0):
         z = form.minima(np.array([weight]))[0]
         assert z[3] == pytest.approx(0.0, abs=1e-12)
@@ -113,7 +113,7 @@ def test_everything_free_is_least_squares() -> None:
     m = model(condition=30.0)
     form = ridge(m, Quadratic(np.zeros(N), np.zeros(N)))
     assert isinstance(form, Ridge)
-    assert form.fixed == N
+    assert form.unpenalized == N
     assert form.minima(np.array([5.0]))[0] == pytest.approx(np.linalg.lstsq(m.A, m.b)[0], rel=1e-8)
     assert form.degrees_of_freedom(5.0) == pytest.approx(N)
 

@@ -83,8 +83,8 @@ def test_the_same_quadratic_gives_the_same_answer_and_all_that_follows(
     scale = problem.parameters.free.scale
     assert result.converged
     assert np.abs((result.x - want.x) / scale).max() < 1e-7
-    assert result.spread.degrees_of_freedom == pytest.approx(want.spread.degrees_of_freedom, rel=1e-7)
-    assert result.spread.noise_variance == pytest.approx(want.spread.noise_variance, rel=1e-6)
+    assert result.fit_covariance.degrees_of_freedom == pytest.approx(want.fit_covariance.degrees_of_freedom, rel=1e-7)
+    assert result.fit_covariance.noise_variance == pytest.approx(want.fit_covariance.noise_variance, rel=1e-6)
     difference = in_scales(result.covariance - want.covariance, problem)
     assert np.abs(difference).max() < 1e-6 * np.abs(in_scales(want.covariance, problem)).max()
     q = problem.data.q[:3]
@@ -144,11 +144,12 @@ def test_a_covariance_means_the_penalty_that_was_stated(
     variance = residual @ residual / (len(residual) - freedom)
     want = variance * np.linalg.inv(normal)
     assert np.abs(result.x / model.parameters.scale - z).max() < 1e-6
-    assert result.spread.degrees_of_freedom == pytest.approx(freedom, rel=1e-6)
-    assert result.spread.noise_variance == pytest.approx(variance, rel=1e-6)
+    assert result.fit_covariance.degrees_of_freedom == pytest.approx(freedom, rel=1e-6)
+    assert result.fit_covariance.noise_variance == pytest.approx(variance, rel=1e-6)
     assert np.abs(in_scales(result.covariance, problem) - want).max() < 1e-6 * np.abs(want).max()
     assert (
-        np.abs(in_scales(result.spread.noise + result.spread.prior, problem) - want).max() < 1e-6 * np.abs(want).max()
+        np.abs(in_scales(result.fit_covariance.noise + result.fit_covariance.prior, problem) - want).max()
+        < 1e-6 * np.abs(want).max()
     )
 
 
@@ -206,7 +207,7 @@ def test_what_a_penalty_cannot_have_is_refused_with_its_name(problem: ro.Calibra
     asked: dict[str, Callable[[], Any]] = {
         "covariance": lambda: result.covariance,
         "prediction": lambda: result.predict(problem.data.q[:2]),
-        "degrees of freedom": lambda: result.spread.degrees_of_freedom,
+        "degrees of freedom": lambda: result.fit_covariance.degrees_of_freedom,
         "uncertainty": lambda: ro.calibration.Uncertainty(result),
         "reml": lambda: ro.calibrate(problem, formulation, ro.reml),
         "gcv": lambda: ro.calibrate(problem, formulation, ro.gcv),

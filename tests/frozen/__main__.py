@@ -98,7 +98,7 @@ def figures(name: str, variant: str | None) -> dict[str, Any]:
             told["expanded"] = str(error)[:60]
     learned = result.learned
     if learned is not None:
-        sizes = {**learned.sizes, **{f"noise {k}": v for k, v in learned.noise.items()}}
+        sizes = {**learned.scales, **{f"noise {k}": v for k, v in learned.noise.items()}}
         told["hyperparameters"] = {key: list(value) for key, value in sizes.items()}
     return told
 

@@ -185,8 +185,8 @@ def test_robust_losses_take_few_passes_more(name: str, variant: str | None, form
 @pytest.mark.usefixtures("too_many")
 def test_inliers_of_a_robust_loss_are_the_same_in_blocks(whole: ro.CalibrationProblem) -> None:
     there, here = ro.calibrate(whole, ro.robust, 1.0), ro.calibrate(apart(whole), ro.robust, 1.0)
-    assert here.spread.linear.equations == there.spread.linear.equations
-    assert here.spread.noise_variance == pytest.approx(there.spread.noise_variance, rel=1e-5)
+    assert here.fit_covariance.linear.equations == there.fit_covariance.linear.equations
+    assert here.fit_covariance.noise_variance == pytest.approx(there.fit_covariance.noise_variance, rel=1e-5)
     np.testing.assert_allclose(here.covariance, there.covariance, rtol=0, atol=1e-5 * np.abs(there.covariance).max())
     chosen = ro.calibrate(apart(whole), ro.robust, ro.reml)
     inliers = inliers_of(ro.robust, *whole.configuration_errors(chosen.x))
@@ -262,9 +262,9 @@ def test_no_digit_depends_on_the_number_of_cores(monkeypatch: pytest.MonkeyPatch
     for count in (1, 2, 5):
         monkeypatch.setattr(threads, "cores", lambda count=count: count)
         model = problem.linearize(x)
-        found.append((model.triangle, problem.errors(x)))
-    for triangle, errors in found[1:]:
-        assert np.array_equal(triangle, found[0][0])
+        found.append((model.qr_factor, problem.errors(x)))
+    for qr_factor, errors in found[1:]:
+        assert np.array_equal(qr_factor, found[0][0])
         assert np.array_equal(errors, found[0][1])
 
 

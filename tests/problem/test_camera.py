@@ -13,7 +13,7 @@ import rpim_opt as ro
 from rpim_opt.data.measurements.camera import INTRINSICS, TARGET
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem import workspace as sight
-from rpim_opt.problem.misreadings import better_reading
+from rpim_opt.problem.misreadings import better_interpretation
 from rpim_opt.problem.registration.camera import normalized, starting_camera, with_poses
 
 BOARD = ro.data.grid_board(4, 3, 0.05)
@@ -280,7 +280,7 @@ def test_a_board_that_is_never_in_sight_is_said(monkeypatch) -> None:
 def test_mistakes_are_found_in_views(change, said: str) -> None:
     problem = ro.load("camera").problem
     wrong = problem.on(replace(problem.data, blocks=(change(problem.data.blocks[0]),)))
-    found = better_reading(wrong)
+    found = better_interpretation(wrong)
     assert found is not None
     assert said in found.remedy
     assert ";" not in found.remedy  # one mistake, and not others that a lens makes plausible
@@ -288,4 +288,4 @@ def test_mistakes_are_found_in_views(change, said: str) -> None:
 
 @pytest.mark.slow
 def test_good_views_are_read_as_they_are() -> None:
-    assert better_reading(ro.load("camera").problem) is None
+    assert better_interpretation(ro.load("camera").problem) is None

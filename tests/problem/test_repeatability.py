@@ -144,5 +144,5 @@ def test_worse_noise_makes_wider_intervals_and_other_weights() -> None:
     problem = ro.load("position").problem
     calm = ro.calibrate(problem, ro.tikhonov, 1.0)
     rough = ro.calibrate(problem.with_repeatability(Repeatability(position=3e-4)), ro.tikhonov, 1.0)
-    assert rough.spread.degrees_of_freedom < calm.spread.degrees_of_freedom
+    assert rough.fit_covariance.degrees_of_freedom < calm.fit_covariance.degrees_of_freedom
     assert rough.converged

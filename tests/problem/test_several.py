@@ -207,7 +207,7 @@ def _stated(result) -> float:
     """Return the variance of the tool that a result states, for noise as declared."""
     names = result.problem.parameters.free.names
     k = [names.index(name) for name in ("tool_x", "tool_y", "tool_z")]
-    return float(np.trace(result.covariance[np.ix_(k, k)])) / result.spread.noise_variance
+    return float(np.trace(result.covariance[np.ix_(k, k)])) / result.fit_covariance.noise_variance
 
 
 def test_a_shared_tool_is_known_better_than_apart() -> None:
@@ -360,7 +360,7 @@ def test_the_covariance_of_shared_parameters_is_right_by_monte_carlo() -> None:
     first = ro.calibrate(measured(whole, truth, seed=0), ro.least_squares)
     names = whole.parameters.free.names
     k = [names.index(name) for name in ("tool_x", "tool_y", "tool_z")]
-    C = first.spread.noise[np.ix_(k, k)] / first.spread.noise_variance
+    C = first.fit_covariance.noise[np.ix_(k, k)] / first.fit_covariance.noise_variance
     found = np.array([ro.calibrate(measured(whole, truth, seed), ro.least_squares).x[k] for seed in range(DRAWS)])
     off = found - [truth[name] for name in ("tool_x", "tool_y", "tool_z")]
     white = np.linalg.solve(np.linalg.cholesky(C), off.T).T
@@ -370,7 +370,7 @@ def test_the_covariance_of_shared_parameters_is_right_by_monte_carlo() -> None:
     assert np.abs(white.mean(axis=0)).max() < 3 / np.sqrt(DRAWS)
     alone = ro.calibrate(left, ro.least_squares)
     own = [left.parameters.free.names.index(name) for name in ("tool_x", "tool_y", "tool_z")]
-    apart = alone.spread.noise[np.ix_(own, own)] / alone.spread.noise_variance
+    apart = alone.fit_covariance.noise[np.ix_(own, own)] / alone.fit_covariance.noise_variance
     assert np.linalg.eigvalsh(apart - C).min() > 0
 
 

@@ -60,14 +60,14 @@ def partitioned(problem: CalibrationProblem, parts: list[ro.Dataset], compute=ma
 
 def test_a_triangle_says_all_that_a_squared_loss_sees(whole: CalibrationProblem) -> None:
     x = 0.1 * whole.parameters.free.scale
-    rows, triangle = whole.linearize(x), reduced(whole, x)
-    assert triangle.A.shape == (len(x) + 1, len(x))
-    assert triangle.equations == rows.equations == 3 * PARTS * ROWS
+    rows, qr_factor = whole.linearize(x), reduced(whole, x)
+    assert qr_factor.A.shape == (len(x) + 1, len(x))
+    assert qr_factor.equations == rows.equations == 3 * PARTS * ROWS
     for z in np.random.default_rng(0).normal(size=(5, len(x))):
-        there, here = (np.linalg.norm(m.A @ z - m.b) for m in (rows, triangle))
+        there, here = (np.linalg.norm(m.A @ z - m.b) for m in (rows, qr_factor))
         assert here == pytest.approx(there, rel=1e-12)
     gram = rows.A.T @ rows.A
-    np.testing.assert_allclose(triangle.A.T @ triangle.A, gram, atol=1e-12 * np.abs(gram).max())
+    np.testing.assert_allclose(qr_factor.A.T @ qr_factor.A, gram, atol=1e-12 * np.abs(gram).max())
 
 
 @pytest.mark.parametrize("name", ["position", "mixed", "pose", "tracker", "markers"])
@@ -98,9 +98,9 @@ def test_parts_give_the_answer_of_the_rows(whole: CalibrationProblem, parts: lis
     again = ro.calibrate(partitioned(whole, parts), ro.tikhonov, there.weight)
     fixed = ro.calibrate(whole, ro.tikhonov, there.weight)
     np.testing.assert_allclose(again.x, fixed.x, rtol=0, atol=1e-13)
-    assert again.spread.linear.equations == fixed.spread.linear.equations == 3 * PARTS * ROWS
-    assert again.spread.noise_variance == pytest.approx(fixed.spread.noise_variance, rel=1e-9)
-    assert 0.9 < again.spread.noise_variance < 1.1  # as simulated
+    assert again.fit_covariance.linear.equations == fixed.fit_covariance.linear.equations == 3 * PARTS * ROWS
+    assert again.fit_covariance.noise_variance == pytest.approx(fixed.fit_covariance.noise_variance, rel=1e-9)
+    assert 0.9 < again.fit_covariance.noise_variance < 1.1  # as simulated
     np.testing.assert_allclose(again.covariance, fixed.covariance, rtol=0, atol=1e-9 * np.abs(fixed.covariance).max())
 
 
@@ -140,7 +140,7 @@ def test_large_problems_are_solved_in_parts_of_whole_configurations(whole, monke
     monkeypatch.undo()
     np.testing.assert_allclose(result.x, ro.calibrate(whole, ro.tikhonov, 1.0).x, rtol=0, atol=1e-13)
     assert result.problem is whole  # parts are how it is solved, not what was asked
-    assert result.spread.linear.equations == 3 * len(whole.data)
+    assert result.fit_covariance.linear.equations == 3 * len(whole.data)
 
 
 def test_what_needs_rows_says_so(whole: CalibrationProblem, parts: list[ro.Dataset]) -> None:
@@ -245,7 +245,9 @@ def test_workers_get_a_users_function_as_it_was_asked() -> None:
         asked.append(size[0])
         return size[0] * T[:3, 3]
 
-    mine = ro.data.Measurement("mine", model, dict.fromkeys("xyz", "length"), noise={"position": "length"}, sees=("q",))
+    mine = ro.data.Measurement(
+        "mine", model, dict.fromkeys("xyz", "length"), noise={"position": "length"}, depends_on=("q",)
+    )
     ready = ro.load("position").problem
     data = replace(ready.data, blocks=(replace(ready.data.blocks[0], measurement=mine),))
     frozen = ready.on(data).frozen()

@@ -184,7 +184,7 @@ def test_elimination_is_a_fit_with_the_points_as_unknowns(data: ro.Dataset, join
             start += k
     if found.planar[0]:
         for thing, index in zip(where, found.rows, strict=True):
-            show[index] = thing.seen(show[index])
+            show[index] = thing.observed(show[index])
         shown = np.concatenate([index[:, 0] for index in found.rows])
     used = np.concatenate([shown, tied])
     X = (show @ X)[used]
@@ -205,7 +205,7 @@ def test_rows_may_stand_in_any_order() -> None:
     order = np.random.default_rng(0).permutation(len(problem.data))
     x = near(problem)
     one, other = (each.linearize(x) for each in (problem, problem.on(problem.data.take(order))))
-    assert one.triangle.T @ one.triangle == pytest.approx(other.triangle.T @ other.triangle, rel=1e-8, abs=1e-3)
+    assert one.qr_factor.T @ one.qr_factor == pytest.approx(other.qr_factor.T @ other.qr_factor, rel=1e-8, abs=1e-3)
 
 
 def test_a_robot_that_shrinks_leaves_as_much() -> None:
@@ -242,7 +242,7 @@ def test_in_parts_as_in_memory() -> None:
     assert model.equations == problem.linearize(x).equations
     # touches of a part count in units of that part's spread, which the deviations change by some 1e-3
     assert np.ptp(spread) > 0
-    assert np.linalg.norm(model.triangle) == pytest.approx(np.linalg.norm(problem.linearize(x).triangle), rel=0.01)
+    assert np.linalg.norm(model.qr_factor) == pytest.approx(np.linalg.norm(problem.linearize(x).qr_factor), rel=0.01)
 
 
 def test_covariances_of_rows_are_those_of_what_they_are_off_their_mean() -> None:

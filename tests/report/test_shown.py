@@ -23,7 +23,7 @@ OBJECTS = {
     "robot": INSTANCE.problem.robot,
     "parameters": INSTANCE.problem.parameters,
     "result": RESULT,
-    "linear": RESULT.spread.linear,
+    "linear": RESULT.fit_covariance.linear,
     "identified": RESULT.program.model.parameters,
     "selection": RESULT.selection,
     "program": RESULT.program,

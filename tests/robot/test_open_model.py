@@ -267,7 +267,7 @@ def test_scales_and_the_learned_prior_know_its_parameters() -> None:
     assert not own.parameters.free.of_frames[-3:].any()
     learned = ro.calibrate(own)
     assert learned.converged
-    assert set(learned.learned.sizes) == {"lengths", "angles", "own", "base"}
+    assert set(learned.learned.scales) == {"lengths", "angles", "own", "base"}
     assert " own2 " in words.parameter_table(learned)
 
 
@@ -412,7 +412,7 @@ def test_a_measurement_may_see_joint_values_torques_and_columns() -> None:
         seen,
         {"z": "length"},
         parameters={"gain": "length"},
-        sees=("q", "torque", "hours"),
+        depends_on=("q", "torque", "hours"),
         extra={"hours": ""},
     )
     torque = np.random.default_rng(4).uniform(-10, 10, (N, 6))
@@ -426,13 +426,13 @@ def test_a_measurement_may_see_joint_values_torques_and_columns() -> None:
         problem.on(ro.Dataset.of(Q, np.zeros((N, 1)), SIGMA, measurement=kind, columns={"hours": hours})).residual(
             np.zeros(2)
         )
-    with pytest.raises(ro.InputError, match="sees: found 'speed'"):
-        replace(kind, sees=("speed",))
+    with pytest.raises(ro.InputError, match="depends_on: found 'speed'"):
+        replace(kind, depends_on=("speed",))
 
 
 def test_two_points_are_seen_as_two_columns() -> None:
     kind = ro.data.Measurement(
-        "difference", lambda T1, T2, q: q[1, 1] - q[1, 0], {"z": "length"}, points=2, sees=("q",)
+        "difference", lambda T1, T2, q: q[1, 1] - q[1, 0], {"z": "length"}, points=2, depends_on=("q",)
     )
     q = np.stack([Q, Q[::-1]], axis=1)
     parameters = ro.robot.model_parameters(ARM).identify(["d1"])

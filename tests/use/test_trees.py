@@ -386,7 +386,7 @@ def test_one_joint_off_its_zero_leaves_the_others_where_they_are(tmp_path: Path)
         data = {side: ro.Dataset.of(parts[side].data.q, y, SIGMA) for side, y in zip(parts, measured, strict=True)}
         result = ro.calibrate(problem.on(ro.Dataset.of_robots(data)))
         assert result.learned is not None
-        assert {"lengths", "angles"} <= set(result.learned.sizes)
+        assert {"lengths", "angles"} <= set(result.learned.scales)
         missed = np.concatenate(elsewhere.modelled(x)) - np.concatenate(elsewhere.modelled(result.x))
         errors.append(np.sqrt(np.mean(missed**2)))
     assert errors[1] < 1.1 * errors[0]

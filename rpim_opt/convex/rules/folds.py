@@ -185,10 +185,10 @@ def _of_squares(program: Program) -> Score:
     With f = s^2 / (s^2 + weight) and residuals r of all, r_g^- = (1 - Q_g diag(f) Q_g')^-1 r_g.
     """
     form, model = program.ridge, program.squared
-    s = form.s[form.seen]
+    s = form.s[form.identifiable]
     # directions that the penalty leaves free stand beside the others with infinite s^2
-    s2 = np.concatenate([s**2, np.full(form.fixed, 1e300)])
-    Q = model.A @ np.hstack([form.B[:, form.seen] / s, form.free])
+    s2 = np.concatenate([s**2, np.full(form.unpenalized, 1e300)])
+    Q = model.A @ np.hstack([form.B[:, form.identifiable] / s, form.free])
     target = model.b - model.A @ form.offset
     projected = Q.T @ target
     _, which, count = np.unique(model.group, return_inverse=True, return_counts=True)

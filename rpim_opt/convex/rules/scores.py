@@ -74,7 +74,7 @@ def reml(program: Program) -> Selection:
     if frames.any() and not frames.all():
         form = ridge(model, robot_alone(program.penalty_form or identity(len(frames)), frames))
     beta2, s2, perp = form.filters
-    m = model.equations - form.fixed
+    m = model.equations - form.unpenalized
 
     def score(weights: Array) -> Array:  # -2 ln(restricted likelihood), up to a constant
         g = weights[:, None] / (s2 + weights[:, None])

@@ -201,7 +201,7 @@ def weight_grid(program: Program, count: int = 200) -> Array:
 
 def grid_of(form: Ridge, count: int = 200, least: float = 0.0) -> Array:
     """Return the grid of weights of a closed-form estimator, from its singular values, above ``least`` s_1^2."""
-    s = form.s[form.seen]
+    s = form.s[form.identifiable]
     if not len(s):
         raise InputError("data", "no sensitivity to any identified parameter", "data that depend on at least one")
     return np.geomspace(max(1e-4 * s[-1] ** 2, least * s[0] ** 2), 10 * s[0] ** 2, count)

@@ -635,7 +635,7 @@ def nearest(p: Canonical, z: Array) -> Array:
 TRTRS: Any = get_lapack_funcs("trtrs", dtype=float)
 
 
-def by_triangle(T: Array, b: Array, transposed: bool = False) -> Array:
+def triangular_solution(T: Array, b: Array, transposed: bool = False) -> Array:
     """Return T^-1 b, or T'^-1 b, of an upper triangular T: SciPy's `solve_triangular` takes five times as long."""
     return TRTRS(T, b, trans=int(transposed))[0]
 
@@ -665,14 +665,14 @@ def on_working_set(
         pivots = np.abs(np.diag(T))
         rank = int((pivots > 1e-11 * pivots.max(initial=0.0)).sum())
         Y, Z, T = Q[:, :rank], Q[:, rank:], T[:rank, :rank]
-        x = near + Y @ by_triangle(T, (b - A @ near)[order[:rank]], transposed=True)
+        x = near + Y @ triangular_solution(T, (b - A @ near)[order[:rank]], transposed=True)
     if Z.shape[1]:
         reduced = np.vstack([np.sqrt(2) * squares.R @ Z[at], np.sqrt(weight) * root @ Z])
         L: Any = np.linalg.qr(reduced, mode="r")
         pivots = np.abs(np.diag(L))
         if len(L) == Z.shape[1] and pivots.min() > RANK_TOLERANCE * pivots.max():
             for _ in range(3):
-                x = x - Z @ by_triangle(L, by_triangle(L, Z.T @ gradient(x), transposed=True))
+                x = x - Z @ triangular_solution(L, triangular_solution(L, Z.T @ gradient(x), transposed=True))
         else:  # some directions have no curvature: the minimum next to x, unless there is a slope along them
             largest = np.abs(squares.R).max()
             _, values, V = np.linalg.svd(reduced, full_matrices=False)
@@ -688,5 +688,5 @@ def on_working_set(
                 return None
     multipliers = np.zeros(len(b))
     if rank:
-        multipliers[order[:rank]] = by_triangle(T, -Y.T @ gradient(x))
+        multipliers[order[:rank]] = triangular_solution(T, -Y.T @ gradient(x))
     return x, multipliers

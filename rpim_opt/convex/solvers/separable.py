@@ -2,8 +2,8 @@
 
 Around a point the loss has a quadratic model; its minimum with the penalty and the constraints is a small program, and
 a line search on the true loss ends the step. A non-smooth loss is smoothed by convolution with a box, or by
-sqrt(v^2 + h^2) of norms, with a falling width h; then the rows near a kink are taken as they are (Lee, Sun and Saunders
-2014, SIAM J. Optim. 24:1420).
+sqrt(v^2 + h^2) of norms, with a falling width h; then the rows near a non-smooth point are taken as they are (Lee, Sun
+and Saunders 2014, SIAM J. Optim. 24:1420).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ STEPS = 60
 FEW_ENTRIES = 400
 """Entries of a loss up to which Clarabel takes them all as they are, where that is quicker."""
 NEAR = 6
-"""Times the number of parameters: rows near a kink that are taken as they are."""
+"""Times the number of parameters: rows near a non-smooth point that are taken as they are."""
 SMOOTHED = 0.02
 """Part of what smoothing may add to the loss below which Newton stops at a width."""
 NARROWER = 10.0
@@ -54,7 +54,7 @@ exactly, relative."""
 SCALED = ("AddExpression", "multiply", "MulExpression", "DivExpression", "reshape", "Promote")
 """Expressions below which a maximum is looked for."""
 JUMP = 1e-3
-"""Part of the slope's total variation above which a jump counts as a kink."""
+"""Part of the slope's total variation above which a jump counts."""
 PROBES = 64
 """Entries at which kinks are looked for."""
 
@@ -70,7 +70,7 @@ class Rows:
     A: Array
     b: Array
     counts: np.ndarray | None
-    triangle: Array
+    qr_factor: Array
 
     @cached_property
     def starts(self) -> np.ndarray:
@@ -81,19 +81,19 @@ class Rows:
     @cached_property
     def squares(self) -> ReducedSquares:
         """|A z - b|^2, or a quadratic loss, reduced."""
-        return ReducedSquares.of_factor(self.triangle)
+        return ReducedSquares.of_factor(self.qr_factor)
 
     @cached_property
     def whitened(self) -> tuple[Array, Array]:
         """U (m, r) and T (r, n) with A = U T and U'U = 1: in u = T z every model of a loss is well conditioned."""
         n = self.A.shape[1]
-        _, s, V = np.linalg.svd(self.triangle[:, :n])
+        _, s, V = np.linalg.svd(self.qr_factor[:, :n])
         V = V[: len(s)]
         seen = s > VANISHED * s[0]
         s, V = s[seen], V[seen]
         return self.A @ (V.T / s), s[:, None] * V
 
-    def spread(self, v: Array) -> Array:
+    def by_equation(self, v: Array) -> Array:
         """Return numbers of entries (N,) by equation (m,)."""
         return v if self.counts is None else np.repeat(v, self.counts)
 
@@ -125,7 +125,7 @@ class Rows:
 class Newton:
     """One search for the minimum of loss(A z - b) + damping(z) + weight penalty(z) subject to constraints.
 
-    ``small`` is the program of squares, penalty and constraints; ``kink`` the largest jump of the loss's slope, 0 where
+    ``small`` is the program of squares, penalty and constraints; ``jump`` the largest jump of the loss's slope, 0 where
     it is smooth.
     """
 
@@ -135,7 +135,7 @@ class Newton:
     small: ReducedProgram
     weight: float
     damping: Damping | None
-    kink: float
+    jump: float
     steps: int = 0
     x: Array = field(default_factory=lambda: np.zeros(0))
     point: Point | None = None
@@ -147,7 +147,7 @@ class Newton:
         if self.rows.counts is None:
             return self.loss.smooth(r, h)[0] if h else self.loss.slope(r)
         v = np.sqrt(np.add.reduceat(r * r, self.rows.starts) + h * h)
-        return self.rows.spread(self.loss.slope(v) / np.maximum(v, 1e-300)) * r
+        return self.rows.by_equation(self.loss.slope(v) / np.maximum(v, 1e-300)) * r
 
     def _model(self, r: Array, h: float, out: np.ndarray | None = None) -> tuple[Array, Array]:
         """Return gradient and Hessian of the smoothed loss by u = T z, without the entries ``out``."""
@@ -168,8 +168,8 @@ class Newton:
             across[out] = 0.0
             along[out] = 0.0
         across = np.maximum(across, 0.0)
-        unit = r / self.rows.spread(np.sqrt(np.maximum(inner, 1e-300)))
-        wide = self.rows.spread(across)
+        unit = r / self.rows.by_equation(np.sqrt(np.maximum(inner, 1e-300)))
+        wide = self.rows.by_equation(across)
         H = gram(U, wide)
         curved = np.flatnonzero(np.abs(along - across) > 1e-9 * across.max(initial=0.0))
         if len(curved):
@@ -295,19 +295,19 @@ class Newton:
     def _added(self, v: Array, h: float) -> float:
         """Return what smoothing with width h may add to the loss: to that of a norm everywhere."""
         if self.rows.counts is None:
-            return self.kink * h * np.count_nonzero(np.abs(v) < h)
-        return self.kink * float(np.sum(np.hypot(v, h) - v))
+            return self.jump * h * np.count_nonzero(np.abs(v) < h)
+        return self.jump * float(np.sum(np.hypot(v, h) - v))
 
     def _near(self, v: Array, h: float) -> np.ndarray:
-        """Return the entries within h of a kink."""
+        """Return the entries within h of a non-smooth point."""
         if self.rows.counts is None:
             rise = self.loss.slope(v + h) - self.loss.slope(v - h)
-            return np.flatnonzero(rise > 0.1 * self.kink)
+            return np.flatnonzero(rise > 0.1 * self.jump)
         rise = self.loss.slope(v + h) - self.loss.slope(np.maximum(v - h, -1e-12))
-        return np.flatnonzero((rise > 0.1 * self.kink) | (v < h))
+        return np.flatnonzero((rise > 0.1 * self.jump) | (v < h))
 
     def _exact(self, z: Array, h: float) -> Array | None:
-        """Return the minimum with rows near a kink as they are, the others by their model, until no other row bends."""
+        """Return the minimum with rows near a non-smooth point as they are and the others by their quadratic model."""
         at, T = self.canonical.at, self.rows.whitened[1]
         near = self._near(self.rows.entries(self._residual(z)), 3 * h)
         few = max(NEAR * self.rows.A.shape[1], 200)
@@ -342,7 +342,7 @@ class Newton:
             if promised <= 1e-9 * max(abs(value), 1e-9):
                 self.x, self.point = x, best
                 return z
-            curved = np.abs(self.loss.slope(v_ahead) - self.loss.slope(v)) > 0.1 * self.kink
+            curved = np.abs(self.loss.slope(v_ahead) - self.loss.slope(v)) > 0.1 * self.jump
             beside = self._near(self.rows.entries(self._residual(z)), h)
             near = np.union1d(near, np.union1d(np.flatnonzero(curved), beside))
         return None
@@ -478,7 +478,7 @@ class Loss:
         total = cp.sum(_restricted(self.entries, self.variable, own, which))
         return Canonical(total if self.threshold is None else total + self.threshold, [], own)
 
-    def kink(self, rows: Rows) -> float:
+    def slope_jump(self, rows: Rows) -> float:
         """Return the largest jump of the slope by residuals of usual size, or where norms are zero; 0 for none."""
         size = float(np.sqrt(np.mean(rows.entries(rows.b) ** 2))) or 1.0
         which = np.unique(np.linspace(0, self.variable.size - 1, PROBES).astype(int))
@@ -500,7 +500,7 @@ class Loss:
             low, slope_low = np.where(left, low, middle), np.where(left, slope_low, at)
         jump = slope_high - slope_low
         kink = float(jump.max()) if (jump > JUMP * total).any() else 0.0
-        if self.positive:  # f(|r|) has a kink where f rises at once
+        if self.positive:  # f(|r|) is not smooth where f rises at once
             at_zero, far = (float(self.slope(np.full(self.variable.size, at)).max()) for at in (1e-12 * size, size))
             kink = max(kink, at_zero) if at_zero > 1e-3 * far else kink
         return kink

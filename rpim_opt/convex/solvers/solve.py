@@ -44,7 +44,7 @@ class WarmStart:
     count: int = 0
     part: tuple[np.ndarray, ReducedProgram] | None = None
     small: dict[Any, ReducedProgram] = field(default_factory=dict)
-    kink: float = -1.0
+    jump: float = -1.0
     parts: dict[Structure, WarmStart] = field(default_factory=dict)
     lock: Any = field(default_factory=threading.RLock)
 
@@ -76,7 +76,7 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
     separable, few entries       all rows in Clarabel, where that is quicker
     separable, smooth            proximal Newton, a sequence of small programs
     separable, non-smooth        the same on the smoothed loss, then rows where it bends
-    with a threshold             entries near a kink as they are, tangents of others
+    with a threshold             entries near a non-smooth point as they are, tangents of others
     any other                    all rows in Clarabel
     ============================ ===================================================
 
@@ -110,17 +110,17 @@ def _by_newton(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: 
     quick = begun or (warm.canonical.polyhedral and warm.canonical.size == len(warm.canonical.at))
     if few and (loss.expression.is_pwl() or (loss.piecewise_quadratic and not quick)):
         return _all_rows(loss, rows, warm, weight, damping)
-    if warm.kink < 0:
-        warm.kink = loss.kink(rows)
-    if few and warm.kink:
+    if warm.jump < 0:
+        warm.jump = loss.slope_jump(rows)
+    if few and warm.jump:
         return _all_rows(loss, rows, warm, weight, damping)
     small = warm.program(rows.A.shape[1] + 1)
     z, x = warm.z, warm.x
     if z is None or x is None:
         x = small.solve(rows.squares.damped(damping), weight).x
         z = x[warm.canonical.at]
-    search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.kink)
-    if warm.kink:
+    search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.jump)
+    if warm.jump:
         z, warm.width = search.non_smooth(z, x, warm.width, begun)
     else:
         z = search.smooth(z, x)
@@ -148,8 +148,8 @@ def _all_rows(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: D
 def _coupled(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
     """Return the minimum of a loss with a threshold (a maximum, CVaR, the sum of the largest) by some of its entries.
 
-    Those near a kink are taken as they are and all others by their tangents, which bounds the loss from below; those
-    that then have other slopes are added, until the bound is reached. Of any other loss all rows are taken.
+    Those near a non-smooth point are taken as they are and all others by their tangents, which bounds the loss from
+    below; those that then have other slopes are added until the bound is reached. Of any other loss all rows are taken.
     """
     n, at = rows.A.shape[1], warm.canonical.at
     if loss.variable.size <= FEW_ENTRIES or loss.threshold is None:
@@ -167,7 +167,7 @@ def _coupled(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Da
     for generation in range(GENERATIONS):
         outside = np.ones(loss.variable.size, dtype=bool)
         outside[working] = False
-        slope = np.where(rows.spread(outside), tangent.slope, 0.0)
+        slope = np.where(rows.by_equation(outside), tangent.slope, 0.0)
         if small is None or small.rows != len(terms.y):
             small = rows.program(loss, working, warm.canonical, len(terms.y))
             small.data.clarabel.attempts = (EQUILIBRATED,)
@@ -211,11 +211,11 @@ class Tangent:
         self.constant = values - pull * self.v - self.by_threshold * t
         self.slope = self.pull
         if loss.positive:
-            self.slope = rows.spread(self.pull / np.maximum(self.v, TINY)) * r
+            self.slope = rows.by_equation(self.pull / np.maximum(self.v, TINY)) * r
 
     @cached_property
     def near(self) -> np.ndarray:
-        """The entries (N,) in the order of their distance from a kink."""
+        """The entries (N,) in the order of their distance from a non-smooth point."""
         far = np.full(len(self.v), np.inf)
         for h in np.abs(self.v).max() * np.geomspace(2, 1e-8, 20):
             low = np.maximum(self.v - h, 0.0) if self._positive else self.v - h

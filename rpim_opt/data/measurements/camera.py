@@ -89,7 +89,7 @@ eye_in_hand = Measurement(
     noise={"pixel": "pixel"},
     parameters={f"camera_{name}": d for name, d in INTRINSICS.items()}
     | {f"board_{name}": d for name, d in STRETCH.items()},
-    sees=tuple(TARGET),
+    depends_on=tuple(TARGET),
     extra=TARGET,
     names=("point",),
     accepted=dict.fromkeys(

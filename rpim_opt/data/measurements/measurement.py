@@ -44,7 +44,7 @@ class Measurement(Brief):
     (4 x 4) of the reflector in the instrument's frame, one for each of the ``points`` of the robot that a row involves
     (2 for the distance between two), and the measurement's own ``parameters``, name to dimension; ``anchor_x`` is given
     as ``x`` of a table ``[anchor]``. ``frames`` are the prefixes of those that are frames, six each: the model gets one
-    transform instead. It also gets what it ``sees``, by keyword: ``"q"`` for the joint values of the model, (dof, 1),
+    transform instead. It also gets what it ``depends_on``, by keyword: ``"q"`` for the model's joint values, (dof, 1),
     of two points (dof, 2), ``"torque"`` for the measured joint torques in the same shape, and columns of the data by
     name; ``extra`` has those columns, name to dimension, and ``accepted`` the text of the message where one is missing.
 
@@ -96,7 +96,7 @@ class Measurement(Brief):
     start: Callable[[Array, Array], Mapping[str, float]] | None = None
     forms: tuple[tuple[Mapping[str, str], Callable[[Array], Array]], ...] = ()
     prepare: Callable[[Array], Array] = lambda y: y
-    sees: tuple[str, ...] = ()
+    depends_on: tuple[str, ...] = ()
     extra: Mapping[str, str] = field(default_factory=dict)
     touching: bool = False
     planar: bool = False
@@ -127,10 +127,10 @@ class Measurement(Brief):
     def __post_init__(self) -> None:
         for dimensions in (self.columns, self.components, self.noise, self.parameters, self.extra):
             require_columns(dimensions, f"measurement {self.name}")
-        for name in self.sees:
+        for name in self.depends_on:
             if name not in ("q", "torque", *self.extra):
                 accepted = "'q', 'torque', or a column of its extra"
-                raise InputError(f"measurement {self.name}, sees", f"'{name}'", accepted)
+                raise InputError(f"measurement {self.name}, depends_on", f"'{name}'", accepted)
         if not self.components:
             object.__setattr__(self, "components", self.columns)
         if not self.noise:

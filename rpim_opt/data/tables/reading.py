@@ -152,7 +152,7 @@ def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str
     columns = quantities_of(table, known, text_columns(kind), label)
     # joints, measured values, and whole groups of what is there in part
     joints, *groups = ([f"{stem}{i}" for i in range(1, robot.dof + 1)] for stem in ("q", "tau", "approach"))
-    required = [*joints, *values_form(columns, kind)[0], *(name for name in kind.sees if name in kind.extra)]
+    required = [*joints, *values_form(columns, kind)[0], *(name for name in kind.depends_on if name in kind.extra)]
     if kind.points == 2:
         groups += [[f"to_{stem}" for stem in group] for group in (joints, *groups)]
     for group in groups:

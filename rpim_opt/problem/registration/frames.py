@@ -441,16 +441,16 @@ def ridge_deviations(alone: Source, steps: int = 200, prior: tuple[Array, Array]
     start = np.linalg.lstsq(L, c, rcond=None)[0] if prior else c
     at: list[Array] = []  # where it was linearized last, and the factor: slopes are evaluated where residuals were
 
-    def triangle(z: Array) -> Array:
+    def qr_factor(z: Array) -> Array:
         if not at or not np.array_equal(at[0], z):
-            at[:] = z.copy(), source.linearize(scale * z).triangle
+            at[:] = z.copy(), source.linearize(scale * z).qr_factor
         return at[1]
 
     def residual(z: Array) -> Array:
-        return np.concatenate([triangle(z) @ [*z, -1.0], L @ z - c])
+        return np.concatenate([qr_factor(z) @ [*z, -1.0], L @ z - c])
 
     def slopes(z: Array) -> Array:
-        return np.vstack([triangle(z)[:, :-1], L])
+        return np.vstack([qr_factor(z)[:, :-1], L])
 
     options: Any = {"jac": slopes, "x_scale": "jac", "xtol": 1e-11, "ftol": 1e-15, "gtol": 1e-15}
     z = least_squares(residual, start, method="lm", max_nfev=steps, **options).x

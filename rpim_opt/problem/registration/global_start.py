@@ -434,7 +434,7 @@ def _judged(
         return None
     near, inliers = _likely(points, fits)
     given = len(sign)
-    if problem is not None and not points.seen:
+    if problem is not None and not points.by_camera:
         plainer, more = _plainer(points, problem, sign[near], Fit(*(each[near] for each in fits)), inliers)
         near += range(given, given + len(plainer))
         sign, fits = np.vstack([sign, plainer]), stacked([fits, more])

@@ -47,7 +47,7 @@ class Points:
     tools: Array  # (M, 3) where these are stated in the flange frame [m]
     turns: Array | None  # (N, 3, 3) orientations
     row: np.ndarray  # (N,) of the dataset
-    seen: bool = False  # whether they are poses of a camera's views
+    by_camera: bool = False  # whether they are poses of a camera's views
     names: tuple[str, ...] = ("",)  # of the reflectors
 
     def take(self, index: Sequence[int] | np.ndarray) -> Points:
@@ -98,7 +98,7 @@ def points_of(problem: CalibrationProblem) -> Points | None:
         np.concatenate([block.y[:, :3] for block in blocks]),
         marker=np.concatenate([np.full(len(block.row), markers.index(block.markers[0])) for block in blocks]),
         tools=tools, turns=turns, row=np.array([number[data.label[i]] for block in blocks for i in block.row]),
-        seen=data is not problem.data, names=tuple(markers),
+        by_camera=data is not problem.data, names=tuple(markers),
     )  # fmt: skip
     return whole.take(np.argsort(whole.row, kind="stable")).evenly(MOST_ROWS)
 
