@@ -196,8 +196,7 @@ class Update:
         if self.undetermined:
             lines.append(
                 f"The new rows do not determine the pose of {joined(self.undetermined)}: measure at least three "
-                "configurations with the reflector's positions not on a line, or update without --reset if nothing "
-                "was moved."
+                "configurations with the reflector's positions not on a line, or omit --reset if nothing was moved."
             )
         for name, of in self.errors.items():
             was, now = (f"{of[when]['rms_mm']:.4f} mm" for when in ("before", "after"))
