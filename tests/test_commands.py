@@ -24,7 +24,7 @@ from rpim_opt.basics.files import read_toml
 from rpim_opt.basics.layout import RawTable, TableOptions
 from rpim_opt.basics.units import parse_units
 from rpim_opt.data.measurements.pose import pose, position
-from rpim_opt.data.tables.understanding import understand
+from rpim_opt.data.tables.understanding import interpret
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.library import read_arm
 from rpim_opt.robot.mdh import MDH
@@ -357,7 +357,7 @@ def test_more_names_that_people_use() -> None:
     joints = {f"J{i} [deg]": f"q{i}_deg" for i in range(1, 7)}
     more = {"Wire length [mm]": "distance_mm", "SMR ID": "marker", "Anchor": "fixture", "U (k=2) [mm]": "u95_mm"}
     table = RawTable({name: ["1"] for name in joints | more})
-    found = understand(table, ARM, ro.data.measurements.registry.MEASUREMENTS["cable"], TableOptions())
+    found = interpret(table, ARM, ro.data.measurements.registry.MEASUREMENTS["cable"], TableOptions())
     assert {each.column: each.name for each in found.meant} == joints | more
 
 
@@ -368,7 +368,7 @@ def test_names_that_people_use() -> None:
         "reflector": "marker", "sigma_mm": "sigma_mm", "torque_1": "tau1_Nm",
     }  # fmt: skip
     source = {name: ["1"] for name in (*names, "temperature", "timestamp")}
-    found = understand(RawTable(source), ARM, pose, TableOptions(units=parse_units("rad,mm,Nm")), targets=True)
+    found = interpret(RawTable(source), ARM, pose, TableOptions(units=parse_units("rad,mm,Nm")), targets=True)
     assert list(found.columns) == list(names.values())
     assert [each.column for each in found.meant if each.meaning == "not used"] == ["temperature", "timestamp"]
     assert [each.name for each in found.meant if each.name] == list(names.values())
@@ -376,13 +376,13 @@ def test_names_that_people_use() -> None:
 
 
 def test_joints_may_count_from_zero_or_have_the_files_names() -> None:
-    zero = understand(
+    zero = interpret(
         RawTable({f"q{i}": ["1"] for i in range(6)}), ARM, position, TableOptions(units=parse_units("deg"))
     )
     assert list(zero.columns) == [f"q{i}_deg" for i in range(1, 7)]
     assert (zero.meant[0].column, zero.meant[0].name) == ("q0", "q1_deg")
     joints = ["pan", "lift", "elbow", "w1", "w2", "w3"]
-    named = understand(
+    named = interpret(
         RawTable({name: ["1"] for name in reversed(joints)}),
         ARM,
         position,

@@ -5,6 +5,6 @@ from .new_folder import new_problem as new_problem
 from .own_code import allow_code as allow_code
 from .problem_file import find_problem as find_problem
 from .problem_file import problems_folder as problems_folder
-from .raw import Understanding as Understanding
+from .raw import Interpretation as Interpretation
 from .result_file import load_result as load_result
 from .result_file import save_result as save_result

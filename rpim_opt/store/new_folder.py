@@ -41,7 +41,7 @@ from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, find_robot, read_arm
 from rpim_opt.robot.mdh import MDH, MOUNTINGS, Robot
 from rpim_opt.robot.parameters import frame_of, model_parameters
-from rpim_opt.store.raw import CLEARLY, Understanding, in_time_order, rows_of, understand_of, usual_noise
+from rpim_opt.store.raw import CLEARLY, Interpretation, in_time_order, interpret_tables, rows_of, usual_noise
 
 TABLES = ("identification.csv", "validation.csv", "target.csv")  # of a new folder
 ROBOT_OF_CHAINS = "robot.urdf"
@@ -62,7 +62,7 @@ class Started(NamedTuple):
     folder: Path
     rows: Mapping[str, int]
     notes: tuple[str, ...]
-    understood: Understanding
+    understood: Interpretation
     written: bool = True
 
     def __str__(self) -> str:
@@ -88,7 +88,7 @@ def new_problem(
     chain: str = "",
     target: str = "",
     dh: str = "",
-    understood: Callable[[Understanding], None] | None = None,
+    understood: Callable[[Interpretation], None] | None = None,
     dry_run: bool = False,
 ) -> Started:
     """Make a problem folder that `load` reads, completely or not at all; with ``dry_run`` check all and write nothing.
@@ -123,7 +123,7 @@ def new_problem(
     board = stated_target(target, seen)
     paths, later = _files(data), _files(validation or ())
     tell = understood or (lambda found: None)
-    found = in_time_order(understand_of(arm, paths, measurement, options))
+    found = in_time_order(interpret_tables(arm, paths, measurement, options))
     tell(found)
     kind, how = _kind(arm, found, board, measurement)
     found = replace(found, kind=kind)
@@ -131,7 +131,7 @@ def new_problem(
     held = _held_out(rows, hold_out, seed)
     tables = {identified: _rows(found.columns, ~held), validated: _rows(found.columns, held), seen: board.table}
     if later:
-        other = in_time_order(understand_of(arm, later, kind.name, found.options))
+        other = in_time_order(interpret_tables(arm, later, kind.name, found.options))
         tell(other)
         rows_of(other, on_board(other.columns, board.board), arm, kind)
         tables[validated] = other.columns
@@ -170,12 +170,12 @@ def _held_out(rows: Dataset, fraction: float | None, seed: int) -> np.ndarray:
     return np.isin(rows.configuration, drawn.configuration)
 
 
-def _assumed(found: Understanding) -> dict[str, float]:
+def _assumed(found: Interpretation) -> dict[str, float]:
     """Return the noise that is assumed where no column states any."""
     return {} if any(name.startswith(("sigma", "u95")) for name in found.columns) else usual_noise(found.kind)
 
 
-def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, rows: Dataset) -> Iterator[str]:
+def _remarks(arm: RobotSetup, source: Path, understanding: Interpretation, rows: Dataset) -> Iterator[str]:
     """Yield the assumed noise, base and flange of a converted table, joint values of no joint, lost values."""
     assumed = ", ".join(f"{name} = {value:g}" for name, value in _assumed(understanding).items())
     if assumed:
@@ -205,7 +205,7 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, rows: 
     yield from (f"{text[0].upper()}{text[1:]}" for text in rows_without_values(rows, {"": arm.robot}))
 
 
-def _ignored_joints(arm: RobotSetup, understanding: Understanding) -> str:
+def _ignored_joints(arm: RobotSetup, understanding: Interpretation) -> str:
     """Return the columns of joints behind the robot's last one; empty if there are none."""
     beyond = {f"q{i}" for i in range(arm.robot.dof + 1, arm.robot.dof + 9)}
     further = [name for name in understanding.left_out if recognize(split(name)[0], arm.names).stem in beyond]
@@ -283,7 +283,7 @@ def stated_target(text: str, file: str = TABLES[-1]) -> StatedTarget:
 
 
 def _kind(
-    arm: RobotSetup, found: Understanding, target: StatedTarget, measurement: str | None
+    arm: RobotSetup, found: Interpretation, target: StatedTarget, measurement: str | None
 ) -> tuple[Measurement, str]:
     """Return the measurement type and how it is known; refuse pixels without a board, and a board without pixels."""
     kind = found.kind
@@ -321,7 +321,7 @@ def _kind(
 
 
 def _problem_text(
-    arm: RobotSetup, source: Path, found: Understanding, rows: Dataset, **context: Any
+    arm: RobotSetup, source: Path, found: Interpretation, rows: Dataset, **context: Any
 ) -> tuple[str, str]:
     """Return the text of ``problem.toml``, and what was guessed of the base in a sentence."""
     from jinja2 import Environment, StrictUndefined

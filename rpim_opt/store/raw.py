@@ -24,7 +24,7 @@ from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import seconds, time_column, together
 from rpim_opt.data.tables.names import ORDERS, recognize
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.understanding import Meant, Understood, understand
+from rpim_opt.data.tables.understanding import CanonicalTable, Column, interpret
 from rpim_opt.problem.misreadings import pose_misfit
 from rpim_opt.robot.chain import RobotSetup
 
@@ -42,7 +42,7 @@ Files = Sequence[tuple[Path | None, RawTable]]
 
 
 @dataclass(frozen=True, eq=False)
-class Understanding:
+class Interpretation:
     """Interpretation of raw tables.
 
     ``kind`` is what was measured, ``columns`` one table with our names (texts and numbers as the files have them),
@@ -53,7 +53,7 @@ class Understanding:
     kind: Measurement
     columns: Columns
     raw: Columns
-    tables: tuple[Understood, ...]
+    tables: tuple[CanonicalTable, ...]
     notes: tuple[str, ...]
     options: TableOptions
     file: str
@@ -97,34 +97,34 @@ def usual_noise(kind: Measurement) -> dict[str, float]:
 
 
 def rows_of(
-    found: Understanding, columns: Columns, arm: RobotSetup, kind: Measurement, noise: Mapping[str, float] | None = None
+    read: Interpretation, columns: Columns, arm: RobotSetup, kind: Measurement, noise: Mapping[str, float] | None = None
 ) -> Dataset:
     """Return the measurements of interpreted columns; errors use the file's column names."""
     try:
         return read_data(columns, arm.robot, usual_noise(kind) if noise is None else noise, kind)
     except InputError as error:
         row, mark, ours = error.where.partition(", column ")
-        row += " of those joined" * (bool(mark) and len(found.tables) > 1)
-        own = {each.name: each.column for table in found.tables for each in table.meant if each.name}
+        row += " of those joined" * (bool(mark) and len(read.tables) > 1)
+        own = {each.name: each.column for table in read.tables for each in table.meant if each.name}
         column = own.get(ours, ours)
         where = f"{row}{mark}'{column}'" if column != ours else error.where
-        of_column = [table.file for table in found.tables if column in {each.column for each in table.meant}]
+        of_column = [table.file for table in read.tables if column in {each.column for each in table.meant}]
         accepted = error.accepted
-        units = {name: split(name)[1] for name in found.left_out}
+        units = {name: split(name)[1] for name in read.left_out}
         lengths = [name for name, unit in units.items() if unit and UNITS[unit].dimension == "length"]
         lacking = any(error.found.startswith(f"no column for '{stem}'") for stem in kind.columns)
         if lacking and len(lengths) == 1 and list(kind.columns.values()) == ["length"]:
             accepted += f", or rename '{lengths[0]}'"
-        raise InputError(where, error.found, accepted, error.file or next(iter(of_column), found.file)) from None
+        raise InputError(where, error.found, accepted, error.file or next(iter(of_column), read.file)) from None
 
 
-def understand_of(
+def interpret_tables(
     arm: RobotSetup,
     data: Sequence[Any],
     measurement: str | Measurement | None = None,
     options: TableOptions | None = None,
     targets: bool = False,
-) -> Understanding:
+) -> Interpretation:
     """Interpret raw tables (files or data frames) of measurements, or of targets of the arm's tool, as one table."""
     options = options or TableOptions()
     files = [(path, _upright(raw, arm)) for path, raw in _read(data, options)]
@@ -180,26 +180,26 @@ def _upright(raw: RawTable, arm: RobotSetup) -> RawTable:
 
 def _tables(
     files: Files, arm: RobotSetup, kind: Measurement, options: TableOptions, targets: bool = False
-) -> list[Understood]:
+) -> list[CanonicalTable]:
     tables = []
     for path, raw in files:
         with in_file(path):
-            understood = understand(raw, arm.robot, kind, options, arm.names, targets)
+            understood = interpret(raw, arm.robot, kind, options, arm.names, targets)
         tables.append(replace(understood, file=path.name) if path else understood)
     return tables
 
 
 def _whole(
-    files: Files, arm: RobotSetup, kind: Measurement, options: TableOptions, tables: Sequence[Understood]
-) -> Understanding:
+    files: Files, arm: RobotSetup, kind: Measurement, options: TableOptions, tables: Sequence[CanonicalTable]
+) -> Interpretation:
     with in_file(files[0][0] if len(files) == 1 else None):
         whole = together(tables, arm.robot, kind, options.key, options.within)
     join = {"meaning": "joins the files", "why": "rows of equal keys or of the nearest times"}
     shown = _with_meaning(tables, whole.keys, **join)
-    return Understanding(kind, whole.columns, whole.raw, shown, whole.notes, options, str(files[0][0] or ""))
+    return Interpretation(kind, whole.columns, whole.raw, shown, whole.notes, options, str(files[0][0] or ""))
 
 
-def in_time_order(found: Understanding) -> Understanding:
+def in_time_order(found: Interpretation) -> Interpretation:
     """Return labelled rows in the order of the first column of dates, or of times since 1970, if there is one."""
     columns = {"label": [str(i + 1) for i in range(found.count)], **found.columns}
     unused = [each.column for table in found.tables for each in table.meant if not each.name]
@@ -218,18 +218,18 @@ def in_time_order(found: Understanding) -> Understanding:
     return replace(found, columns=columns, tables=tables)
 
 
-def _with_meaning(tables: Sequence[Understood], columns: Sequence[str], **new: str) -> tuple[Understood, ...]:
+def _with_meaning(tables: Sequence[CanonicalTable], columns: Sequence[str], **new: str) -> tuple[CanonicalTable, ...]:
     """Return tables in which columns, in lower case, that have no other meaning have a new one."""
 
-    def updated(each: Meant) -> Meant:
+    def updated(each: Column) -> Column:
         return each._replace(**new) if each.column.lower() in columns and each.meaning == "not used" else each
 
     return tuple(replace(table, meant=tuple(map(updated, table.meant))) for table in tables)
 
 
-def _checked(first: Understanding, files: Files, arm: RobotSetup, doubt: str, targets: bool) -> Understanding:
+def _checked(first: Interpretation, files: Files, arm: RobotSetup, doubt: str, targets: bool) -> Interpretation:
     """Return poses with the order of a quaternion that fits the nominal robot; refuse turns that are not as usual."""
-    alternatives: dict[str, Understanding] = {}
+    alternatives: dict[str, Interpretation] = {}
     misfit: dict[str, float] = {}
     noise = {"position_mm": 1.0, "orientation_mrad": 1.0}
     for reading in READINGS[doubt]:

@@ -28,7 +28,7 @@ from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.kinematics import FRAME
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import reflectors, tool_prefix
-from rpim_opt.store.raw import Understanding, rows_of, understand_of
+from rpim_opt.store.raw import Interpretation, interpret_tables, rows_of
 from rpim_opt.use.sessions import registered_again
 
 
@@ -48,7 +48,7 @@ def read_targets(
     options: TableOptions | None = None,
     tool: Sequence[float] | Array | None = None,
     marker: str = "",
-) -> tuple[Targets, Understanding]:
+) -> tuple[Targets, Interpretation]:
     """Return the targets of a table, whose columns are recognized by name, and their interpretation.
 
     Columns are joint values (``q1_deg``, ...), positions in the robot's base (``x_mm, y_mm, z_mm``), with
@@ -79,7 +79,7 @@ def read_targets(
     return targets, replace(understanding, notes=tuple(notes))
 
 
-def _targets(robot: Robot, understanding: Understanding) -> Targets:
+def _targets(robot: Robot, understanding: Interpretation) -> Targets:
     """Return the targets of a table, read as measurements are, with zeros for the half that targets need not have."""
     columns = dict(understanding.columns)
     stems = {split_unit(name)[0] for name in columns}
@@ -177,7 +177,7 @@ def read_measurements(
     return Measured(data, left_out, tuple(notes), clock)
 
 
-def _perhaps_radians(result: Calibration, understanding: Understanding, q: Array | None) -> list[str]:
+def _perhaps_radians(result: Calibration, understanding: Interpretation, q: Array | None) -> list[str]:
     """Return a remark on joint values (N, dof) of three or more rows in degrees that radians would explain."""
     turning = [f"q{i}_deg" in understanding.columns for i in range(1, result.problem.robot.dof + 1)]
     if q is None or len(q) < 3 or not any(turning):
@@ -191,7 +191,7 @@ def _perhaps_radians(result: Calibration, understanding: Understanding, q: Array
 
 def _understood(
     result: Calibration, source: Any, kind: Measurement, stated: TableOptions, tool: Array | None = None
-) -> Understanding:
+) -> Interpretation:
     """Return the content of tables, read as the calibration's own were; where that does not fit, by their headers.
 
     They are measurements, or targets of a tool (6,).
@@ -204,10 +204,10 @@ def _understood(
     targets = tool is not None
     arm = RobotSetup(result.problem.robot, tool=np.zeros(6) if tool is None else tool, names=options.joints)
     try:
-        return understand_of(arm, sources, kind, options, targets)
+        return interpret_tables(arm, sources, kind, options, targets)
     except InputError as error:
         if error.where == "rx, ry, rz":  # which no other reading of the table answers
             raise
         with suppress(InputError):  # one that has our names already
-            return understand_of(replace(arm, names=()), sources, kind, stated, targets)
+            return interpret_tables(replace(arm, names=()), sources, kind, stated, targets)
         raise

@@ -17,8 +17,8 @@ from rpim_opt.basics.units import parse_units
 from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import together
-from rpim_opt.data.tables.understanding import Understood, understand
-from rpim_opt.store.raw import understand_of
+from rpim_opt.data.tables.understanding import CanonicalTable, interpret
+from rpim_opt.store.raw import interpret_tables
 
 ARM = ro.robot.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
 ROWS = "P1,1,2,401,5,6\nP2,3,4,402,6,7\n"
@@ -31,10 +31,10 @@ def write(folder: Path, text: str | bytes, name: str = "raw.csv") -> Path:
     return path
 
 
-def read(path: Path, joints: Any = (), robot: Any = ARM, kind: Any = position, **asked: Any) -> Understood:
+def read(path: Path, joints: Any = (), robot: Any = ARM, kind: Any = position, **asked: Any) -> CanonicalTable:
     options = ro.data.TableOptions(**asked)
     try:
-        return replace(understand(read_raw(path, options), robot, kind, options, joints), file=path.name)
+        return replace(interpret(read_raw(path, options), robot, kind, options, joints), file=path.name)
     except ro.InputError as error:
         raise error.within(path) from None
 
@@ -253,7 +253,7 @@ JOINTS = "name,J1 [deg],J2 [deg]\na,1,2\nb,3,4\n"
 VALUES = "name,X [mm],Y [mm],Z [mm]\nb,402,6,7\na,401,5,6\n"
 
 
-def two(folder: Path, joints: str = JOINTS, values: str = VALUES) -> list[Understood]:
+def two(folder: Path, joints: str = JOINTS, values: str = VALUES) -> list[CanonicalTable]:
     return [read(write(folder, joints, "joints.csv")), read(write(folder, values, "values.csv"))]
 
 
@@ -329,7 +329,7 @@ def test_a_german_controllers_and_a_trackers_export_need_no_renaming(tmp_path: P
     text += "".join(f"{i};1,5;2,5;3,5;4,5;5,5;6,5;100,125;200,25;{i}00,5;0,01\n" for i in (1, 2, 3))
     (tmp_path / "raw.csv").write_text(text, encoding="utf-8")
     arm = ro.robot.RobotSetup(robot, np.zeros(6), np.zeros(6))
-    found = understand_of(arm, [tmp_path / "raw.csv"], options=ro.data.TableOptions(units="deg,mm"))
+    found = interpret_tables(arm, [tmp_path / "raw.csv"], options=ro.data.TableOptions(units="deg,mm"))
     assert found.kind is position
     assert set(found.columns) == {"label", *(f"q{i}_deg" for i in range(1, 7)), "x_mm", "y_mm", "z_mm", "u95_mm"}
 

@@ -27,7 +27,7 @@ from rpim_opt.report.console import listed_numbers, payload_of, tool_frame
 from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.library import find_robot
 from rpim_opt.store.problem_file import named_weight, problems_folder
-from rpim_opt.store.raw import understand_of, usual_noise
+from rpim_opt.store.raw import interpret_tables, usual_noise
 from rpim_opt.store.result_file import digest
 
 TWO = ro.robot.Robot("two", np.array([[0.0, 0, 0, 0.3, 0], [1.5, 0.4, 0, 0, 0]]))
@@ -139,7 +139,7 @@ def raw(data: bytes, folder: Path) -> None:
     found = None
     for units in ("", "deg,mm"):
         with suppress(ro.InputError):
-            found = understand_of(arm, [path], options=TableOptions(units=parse_units(units)))
+            found = interpret_tables(arm, [path], options=TableOptions(units=parse_units(units)))
     if found is None:
         raise ro.InputError("raw", "nothing", "something")
     counts = {len(cells) for cells in found.columns.values()}

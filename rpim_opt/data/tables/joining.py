@@ -20,7 +20,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import numeral, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.tables.understanding import Understood, counts_rows, row_stems
+from rpim_opt.data.tables.understanding import CanonicalTable, counts_rows, row_stems
 from rpim_opt.robot.mdh import Robot
 
 TIME = re.compile(r"(?i)[%#]?(?:.*[._/ ])?(time ?stamp|date ?time|time|stamp|(uhr)?zeit|zeitstempel|date|datum|t)"
@@ -62,8 +62,8 @@ class Match(NamedTuple):
 
 
 def together(
-    tables: Sequence[Understood], robot: Robot, kind: Measurement, key: str = "", within: float | None = None
-) -> Understood:
+    tables: Sequence[CanonicalTable], robot: Robot, kind: Measurement, key: str = "", within: float | None = None
+) -> CanonicalTable:
     """Return tables stacked where each is whole, else joined; ``key`` and ``within`` as in `TableOptions`."""
     stems = row_stems(robot, kind)
     moving = [table for table in tables if table.stems & stems["joint"]]
@@ -96,7 +96,7 @@ def together(
     return replace(right, columns=columns, raw={**left.raw, **right.raw}, notes=notes, keys=match.columns)
 
 
-def _stacked(tables: Sequence[Understood]) -> Understood:
+def _stacked(tables: Sequence[CanonicalTable]) -> CanonicalTable:
     """Return the rows of several tables below each other, in the units of the first."""
     first = tables[0]
     if len(tables) == 1:
@@ -117,7 +117,7 @@ def _stacked(tables: Sequence[Understood]) -> Understood:
     return replace(first, columns=whole, raw=raw, notes=tuple(notes))
 
 
-def _in_units_of(first: Understood, table: Understood) -> dict[str, Sequence[Any]]:
+def _in_units_of(first: CanonicalTable, table: CanonicalTable) -> dict[str, Sequence[Any]]:
     """Return the columns of a table, but its labels, by the names and in the units of the first one's."""
     names, own = ({split_unit(name)[0]: name for name in of.columns if name != "label"} for of in (first, table))
     lacking = own.keys() ^ names.keys()
@@ -134,7 +134,7 @@ def _in_units_of(first: Understood, table: Understood) -> dict[str, Sequence[Any
     return columns
 
 
-def _by_key(joints: Understood, values: Understood, key: str) -> Match:
+def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
     """Return the rows of equal keys; where none are equal and all times nearly are, of the nearest times."""
     chosen = _key(joints, values, key)
     count = len(chosen.left)
@@ -165,7 +165,7 @@ def _by_key(joints: Understood, values: Understood, key: str) -> Match:
     return Match([place[name] for name in names], right, names, notes, chosen.columns)
 
 
-def _key(joints: Understood, values: Understood, key: str) -> Key:
+def _key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Key:
     """Return the key as stated, else the label, the only column that both have, or columns of the same values."""
     pairs = _pairs(joints, values, key)
     telling = [pair for pair in pairs if not counts_rows(pair.left)]
@@ -194,7 +194,7 @@ def _only(items: Sequence[Any]) -> Any:
     return items[0] if len(items) == 1 else None
 
 
-def _labels(joints: Understood, values: Understood, others_tell: bool) -> Key | None:
+def _labels(joints: CanonicalTable, values: CanonicalTable, others_tell: bool) -> Key | None:
     """Return the labels that rows with joints and measured ones share, unless they are row numbers and others match."""
     labels = _normal(joints.columns.get("label", ()))
     if others_tell and counts_rows(labels):
@@ -204,7 +204,7 @@ def _labels(joints: Understood, values: Understood, others_tell: bool) -> Key | 
     return next((each for each in keys if {*labels} & {*each.right}), None)
 
 
-def _pairs(joints: Understood, values: Understood, key: str, numbers: bool = False) -> list[Key]:
+def _pairs(joints: CanonicalTable, values: CanonicalTable, key: str, numbers: bool = False) -> list[Key]:
     """Return the keys that two columns make whose values, or the ``numbers`` in these, are nearly the same."""
     keys = (
         _keyed(f"{name} = {other}", (name.lower(), other.lower()), own, others, numbers)
@@ -235,7 +235,7 @@ def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]
     return Key(how + next(examples, ""), columns, left, named)
 
 
-def _naming(table: Understood) -> dict[str, list[str]]:
+def _naming(table: CanonicalTable) -> dict[str, list[str]]:
     """Return the keys of columns, labels or left out, that name every row differently, or every row of a reflector."""
     free = [each.column for each in table.meant if each.name in ("", "label", "configuration")]
     cells = {name: _normal(table.raw[name.lower()]) for name in free if name.lower() in table.raw}
@@ -244,7 +244,7 @@ def _naming(table: Understood) -> dict[str, list[str]]:
     return {name: keys for name, keys in cells.items() if all(keys) and len(rows[name]) == len(keys)}
 
 
-def _row_numbers(joints: Understood, values: Understood, pair: Key | None) -> Key:
+def _row_numbers(joints: CanonicalTable, values: CanonicalTable, pair: Key | None) -> Key:
     """Return the numbers of the rows as the key, unless a pair of columns shows that the rows are in another order."""
     count, other = len(joints.labels), len(values.labels)
     if count != other:
@@ -282,7 +282,7 @@ def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.n
     return partner[rows], rows, (right - left[partner])[rows]
 
 
-def _by_time(joints: Understood, values: Understood, key: str, within: float) -> Match:
+def _by_time(joints: CanonicalTable, values: CanonicalTable, key: str, within: float) -> Match:
     if not (np.isfinite(within) and within >= 0):
         raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
     clocks, (there, then) = zip(*(_times(side, key) for side in (joints, values)), strict=True)
@@ -322,7 +322,7 @@ def _by_time(joints: Understood, values: Understood, key: str, within: float) ->
     return Match(left.tolist(), right.tolist(), names, notes, clocks)
 
 
-def _motion(joints: Understood, times: Array, rows: np.ndarray, moments: Array) -> Array:
+def _motion(joints: CanonicalTable, times: Array, rows: np.ndarray, moments: Array) -> Array:
     """Return the largest change (K,) [deg] of a revolute joint from a row's time to its moment, linear between rows."""
     order = np.argsort(times)
     largest = np.zeros(len(rows))
@@ -334,7 +334,7 @@ def _motion(joints: Understood, times: Array, rows: np.ndarray, moments: Array) 
     return largest
 
 
-def _times(table: Understood, key: str) -> tuple[str, Array]:
+def _times(table: CanonicalTable, key: str) -> tuple[str, Array]:
     """Return the column of a table's times, the stated one if it has it, and the times [s] of its rows."""
     name = key.lower() if key.lower() in table.raw else time_column(table.raw)
     if name is None:

@@ -20,7 +20,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns, numbers
 
 
-class Reading(NamedTuple):
+class Meaning(NamedTuple):
     """Meaning of a column: its quantity, unit and reason, and whether it is measured, commanded or derived."""
 
     stem: str
@@ -29,7 +29,7 @@ class Reading(NamedTuple):
     kind: str = ""
 
 
-Readings = dict[str, Reading]  # what every column holds, by its name
+Meanings = dict[str, Meaning]  # what every column holds, by its name
 
 
 _WHERE = r"(?:(?:field|pose|transform|point|position|translation|pos|p|t|coords?|coordinates?|cartesian|cart|tcp)_?)*"
@@ -103,7 +103,7 @@ VALUE = frozenset({"position", "pos", "angle", "value"})
 """What may stand behind the name of a joint for its value."""
 
 
-def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
+def recognize(stem: str, joints: Sequence[str] = ()) -> Meaning:
     """Return the meaning of a column name with its reason, which is empty for unknown names.
 
     >>> from rpim_opt.data.tables.names import recognize
@@ -122,17 +122,17 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
         if part in joints:
             number, why = joints.index(part) + 1, "a joint of the robot's file"
         if number:
-            return Reading(f"tau{number}" if path[-1] == "effort" else f"q{number}", "", why, kind)
+            return Meaning(f"tau{number}" if path[-1] == "effort" else f"q{number}", "", why, kind)
     for pattern, meaning, *reason in NAMES:
         match = re.fullmatch(pattern, rest)
         if match:
             known = re.sub(r"(?<=[qu])0+(?=\d)", "", match.expand(meaning))
-            return Reading(known, "", "".join(reason) or "a known name", kind)
+            return Meaning(known, "", "".join(reason) or "a known name", kind)
     # u(x) is a standard uncertainty, U(x) an expanded one of unknown coverage factor
     match = re.fullmatch(r"u[\s_(]*([xyzXYZ])\)?", stem.strip())
     if match:
-        return Reading(f"sigma_{match[1].lower()}", "", "u: standard uncertainty", kind)
-    return Reading(plain, "", "", kind)
+        return Meaning(f"sigma_{match[1].lower()}", "", "u: standard uncertainty", kind)
+    return Meaning(plain, "", "", kind)
 
 
 def endings(stem: str) -> Iterator[tuple[str, str]]:
@@ -151,7 +151,7 @@ EULER = re.compile(r"(?:extrinsic|intrinsic) ([xyz])(?!\1)([xyz])(?!\2)[xyz]")
 ROUNDED = 1e-6  # the last row of a matrix is 0 0 0 1 within this
 
 
-def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:
+def numbered(read: Meanings, table: Columns, dof: int, order: str) -> None:
     """Name the numbered columns of quaternions and matrices."""
     if order not in ORDERS:
         raise InputError("--quaternion", f"'{order}'", " or ".join(ORDERS))
@@ -181,7 +181,7 @@ def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:
         read[name] = read[name]._replace(stem=stem, why=why)
 
 
-def _entries(read: Readings) -> dict[str, tuple[int, int]]:
+def _entries(read: Meanings) -> dict[str, tuple[int, int]]:
     """Return the columns of a matrix with their row and column from 0; empty if there is none."""
     digits: dict[str, str] = {}
     for name in read:
@@ -199,7 +199,7 @@ def _entries(read: Readings) -> dict[str, tuple[int, int]]:
     return {name: divmod(k, 4) for k, name in enumerate(ordered)}
 
 
-def quaternion_columns(read: Readings, dof: int) -> list[str]:
+def quaternion_columns(read: Meanings, dof: int) -> list[str]:
     """Return the four numbered columns of a quaternion, in order; ``q0 ... q3`` where these cannot be joints."""
     components: dict[str, dict[int, str]] = {}
     for name in read:

@@ -16,7 +16,7 @@ from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import DISPLAY, UNITS, split, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables import names as known_names
-from rpim_opt.data.tables.names import Reading, Readings, endings, numbered, quaternion_columns, recognize
+from rpim_opt.data.tables.names import Meaning, Meanings, endings, numbered, quaternion_columns, recognize
 from rpim_opt.data.tables.reading import number_columns, text_columns
 from rpim_opt.robot.mdh import Robot
 
@@ -43,8 +43,8 @@ MEANINGS = {
 """What our columns are, in words; the first pattern that fits counts."""
 
 
-class Meant(NamedTuple):
-    """Meaning of a column: its name in the file, its quantity, its canonical name, its unit, and the reason."""
+class Column(NamedTuple):
+    """A column of a file: its name there, its meaning, its canonical name, its unit, and the reason."""
 
     column: str
     meaning: str
@@ -54,7 +54,7 @@ class Meant(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Understood:
+class CanonicalTable:
     """A raw table with canonical names.
 
     ``columns`` are cells by our names, ``raw`` those of the file by its names in lower case, of the same rows. What
@@ -65,7 +65,7 @@ class Understood:
 
     columns: Columns
     raw: Columns
-    meant: tuple[Meant, ...]
+    meant: tuple[Column, ...]
     notes: tuple[str, ...]
     doubt: str = ""
     file: str = "the table"
@@ -82,20 +82,20 @@ class Understood:
         count = len(next(iter(self.columns.values()), ()))
         return [str(label) for label in self.columns.get("label", range(1, count + 1))]
 
-    def take(self, rows: Sequence[int]) -> Understood:
+    def take(self, rows: Sequence[int]) -> CanonicalTable:
         """Return the table of these rows."""
         columns, raw = ({n: [cells[i] for i in rows] for n, cells in c.items()} for c in (self.columns, self.raw))
         return replace(self, columns=columns, raw=raw)
 
 
-def understand(
+def interpret(
     raw: RawTable,
     robot: Robot,
     kind: Measurement,
     options: TableOptions,
     joints: Sequence[str] = (),
     targets: bool = False,
-) -> Understood:
+) -> CanonicalTable:
     """Interpret a raw table with the names that `read_data` takes, leaving out other columns and rows without values.
 
     ``joints`` are the names of the robot's file. Of ``targets`` what was commanded counts; rows may lack either values.
@@ -123,7 +123,7 @@ def understand(
     doubt = "rotation" if len(turns) == 3 and not named and not rotation else ""
     if not options.quaternion and quaternion_columns(read, robot.dof):
         doubt = "quaternion"
-    table = Understood(columns, of_file, tuple(meant), raw.notes, doubt)
+    table = CanonicalTable(columns, of_file, tuple(meant), raw.notes, doubt)
     if not targets:
         table = _rows_with_values(table, robot, kind)
     headed = {UNITS[each.unit].dimension: each for each in meant if each.unit and "in the header" in each.why}
@@ -132,7 +132,7 @@ def understand(
     return replace(table, notes=(*table.notes, *notes))
 
 
-def _as_quaternions(columns: Columns, meant: Sequence[Meant], rotation: str) -> tuple[Columns, list[Meant]]:
+def _as_quaternions(columns: Columns, meant: Sequence[Column], rotation: str) -> tuple[Columns, list[Column]]:
     """Return columns and meanings with a quaternion in the place of three turns."""
     names = {split_unit(name)[0]: name for name in columns}
     if names.keys().isdisjoint(TURNED):  # a file of joint values, beside one of poses
@@ -153,7 +153,7 @@ def _as_quaternions(columns: Columns, meant: Sequence[Meant], rotation: str) -> 
 
 def _readings(
     raw: RawTable, robot: Robot, kind: Measurement, options: TableOptions, targets: bool
-) -> tuple[Readings, str]:
+) -> tuple[Meanings, str]:
     """Return the meaning of every column, None for ignored ones, and the rotation convention in the names."""
     table, dof, joints = raw.columns, robot.dof, options.joints
     names = [*number_columns(robot, kind), *text_columns(kind)]
@@ -185,7 +185,7 @@ def _readings(
             accepted += "'intrinsic xyz'; or --measurement position"
             raise InputError("the header", f"column '{name}', either angles or a rotation vector", accepted)
         if each.stem == "temperature" and not each.unit and "temperature" not in wanted:
-            read[name] = Reading("", "", "a temperature without a unit")
+            read[name] = Meaning("", "", "a temperature without a unit")
     _leave_out_efforts(read, dof, wanted)
     _leave_out(read, targets)
     _choose_label(read, table, options.key)
@@ -197,7 +197,7 @@ def counts_rows(keys: Sequence[str]) -> bool:
     return keys == [str(i) for i in range(1, len(keys) + 1)]
 
 
-def _choose_label(read: Readings, table: Columns, key: str) -> None:
+def _choose_label(read: Meanings, table: Columns, key: str) -> None:
     """Of several labels keep the stated key, or the one that distinguishes rows and is no row number."""
     cells = {name: [str(cell).strip() for cell in table[name]] for name, each in read.items() if each.stem == "label"}
     chosen = [name for name in cells if name.lower() == key.lower()]
@@ -206,10 +206,10 @@ def _choose_label(read: Readings, table: Columns, key: str) -> None:
         groups = [name for name in counting if len(set(cells[name])) > 1]
         chosen = [name for name in groups if _unique(cells[name])] or groups or counting
     if len(cells) > 1 and len(chosen) == 1:
-        read.update({name: Reading("", "", f"'{chosen[0]}' is the label") for name in cells if name != chosen[0]})
+        read.update({name: Meaning("", "", f"'{chosen[0]}' is the label") for name in cells if name != chosen[0]})
 
 
-def _read(name: str, group: str, known: Sequence[str], names: Sequence[str], joints: Sequence[str]) -> Reading:
+def _read(name: str, group: str, known: Sequence[str], names: Sequence[str], joints: Sequence[str]) -> Meaning:
     """Return the meaning of a column; an unknown name becomes its stem."""
     text = name.partition(" #")[0]
     stem, unit = split(text.removeprefix(group).strip())
@@ -218,21 +218,21 @@ def _read(name: str, group: str, known: Sequence[str], names: Sequence[str], joi
     unit = unit or of_group
     for whole in (text, stem):
         if whole in joints:
-            return Reading(f"q{joints.index(whole) + 1}", unit, "a joint of the robot's file")
+            return Meaning(f"q{joints.index(whole) + 1}", unit, "a joint of the robot's file")
     if stem in known:
-        return Reading(stem, unit, "by its name")
+        return Meaning(stem, unit, "by its name")
     if stem.lower() in names:  # elsewhere such a column holds labels
-        return Reading(stem.lower(), unit, "touched point")
+        return Meaning(stem.lower(), unit, "touched point")
     reading = recognize(stem, joints)
     if group and not reading.why:  # the words of a group without meaning
         rests = [rest for _, rest in endings(stem)]
-        inner = [Reading(rest, "", "by its name") if rest in known else recognize(rest, joints) for rest in rests]
+        inner = [Meaning(rest, "", "by its name") if rest in known else recognize(rest, joints) for rest in rests]
         inside = next((each for each in inner if each.why), reading)
         reading = inside._replace(kind=reading.kind or inside.kind)
     return reading._replace(unit=unit)
 
 
-def _put_in_robots_order(read: Readings, table: Columns, dof: int, joints: Sequence[str]) -> None:
+def _put_in_robots_order(read: Meanings, table: Columns, dof: int, joints: Sequence[str]) -> None:
     """Put ROS' joints and their efforts in the robot's order, where columns name0, ... name them."""
     matches = {name: re.fullmatch(r"(?:field_)?name_?(\d{1,9})", reading.stem) for name, reading in read.items()}
     named = {int(match[1]): name for name, match in matches.items() if match}
@@ -253,24 +253,24 @@ def _put_in_robots_order(read: Readings, table: Columns, dof: int, joints: Seque
     _rename(read, new, "the joint named in its name column")
 
 
-def _rename(read: Readings, new: Mapping[str, str], why: str) -> None:
+def _rename(read: Meanings, new: Mapping[str, str], why: str) -> None:
     """Change stems, for a reason that may follow ``{}``, the one so far."""
     for name, each in read.items():
         if each.stem in new:
             read[name] = each._replace(stem=new[each.stem], why=why.format(each.why))
 
 
-def _count_from_one(read: Readings, dof: int) -> None:
+def _count_from_one(read: Meanings, dof: int) -> None:
     """Count the joints from 1, where they are counted from 0."""
     if any(reading.stem == "q0" for reading in read.values()):
         new = {f"{stem}{i}": f"{stem}{i + 1}" for i in range(dof) for stem in ("q", "tau")}
         _rename(read, new, "{}, numbered from 0")
 
 
-def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], stated: str) -> Readings:
+def _without_prefix(read: Meanings, wanted: set[str], joints: Sequence[str], stated: str) -> Meanings:
     """Return the meanings of names without a common prefix; refuse several prefixes if none is stated."""
     known = [name for name, each in read.items() if each.stem in wanted]
-    direct = dict.fromkeys(known, Reading("", "", "another column is the instrument's"))
+    direct = dict.fromkeys(known, Meaning("", "", "another column is the instrument's"))
     bare = any(len(split(name)[0]) == 1 or INSTRUMENT.search(name) for name in known)
     if known and (bare or wanted != COORDINATES):
         return {}
@@ -283,7 +283,7 @@ def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], sta
             whole[prefix] = each
         elif len(missing) < len(wanted) / 2 and not known:  # is it one that did not move
             why = f"of {prefix}, which has no {', '.join(missing)}: --constants"
-            read.update({name: Reading("", "", why) for name in each})
+            read.update({name: Meaning("", "", why) for name in each})
     if known and whole and not all(CONTROLLER.match(name) for name in known):
         own = split(known[0])[0][:-1].strip(" ._/:-")
         whole = {own: {name: read[name] for name in known}} | whole
@@ -294,21 +294,21 @@ def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], sta
     return direct | next(iter(whole.values())) if whole else {}
 
 
-def _prefixed(read: Readings, joints: Sequence[str]) -> dict[str, Readings]:
+def _prefixed(read: Meanings, joints: Sequence[str]) -> dict[str, Meanings]:
     """Return the meanings of unknown names without what stands before them, by that."""
-    by_prefix: dict[str, Readings] = {}
+    by_prefix: dict[str, Meanings] = {}
     for name, each in read.items():
         for prefix, rest in endings(split(name)[0]):
             known = recognize(rest, joints)
             if known.why and known.kind != "derived" and not each.why:
                 bare = prefix.strip(" ._/:-")
-                new = Reading(known.stem, each.unit, f"{known.why}, of {bare}", known.kind or each.kind)
+                new = Meaning(known.stem, each.unit, f"{known.why}, of {bare}", known.kind or each.kind)
                 by_prefix.setdefault(bare, {})[name] = new
                 break  # the shortest prefix: orientation/x is no x
     return by_prefix
 
 
-def _counted(read: Readings, robot: Robot) -> None:
+def _counted(read: Meanings, robot: Robot) -> None:
     """Name counted columns of an unknown word: in joint units the joints, three others (``p_1, p_2, p_3``) x, y, z."""
     words: dict[str, dict[int, str]] = {}
     for name, each in read.items():
@@ -330,7 +330,7 @@ def _counted(read: Readings, robot: Robot) -> None:
             read[name] = read[name]._replace(stem=axis, why="the only three numbered columns besides the joints")
 
 
-def _leave_out_efforts(read: Readings, dof: int, stated: Collection[str]) -> None:
+def _leave_out_efforts(read: Meanings, dof: int, stated: Collection[str]) -> None:
     """Ignore efforts of ROS that may be currents, having no unit and none ``stated``, and those of some joints only."""
     torques = {f"tau{i}" for i in range(1, dof + 1)}
     whole = torques <= {each.stem for each in read.values()}
@@ -338,12 +338,12 @@ def _leave_out_efforts(read: Readings, dof: int, stated: Collection[str]) -> Non
         if "effort" not in name or each.stem not in torques:
             continue
         if not each.unit and {each.stem, "tau", "torque"}.isdisjoint(stated):
-            read[name] = Reading("", "", "an effort without a unit: --units Nm if it is a torque")
+            read[name] = Meaning("", "", "an effort without a unit: --units Nm if it is a torque")
         elif not whole:
-            read[name] = Reading("", "", "not all joints have an effort")
+            read[name] = Meaning("", "", "not all joints have an effort")
 
 
-def _leave_out(read: Readings, targets: bool) -> None:
+def _leave_out(read: Meanings, targets: bool) -> None:
     """Ignore computed columns, and commanded ones where measured ones exist; for targets ignore measured ones."""
     measured = {each.stem for each in read.values() if each.kind in ("", "measured")}
     named = {each.stem for name, each in read.items() if each.kind == "measured" and INSTRUMENT.search(name)}
@@ -368,7 +368,7 @@ def _leave_out(read: Readings, targets: bool) -> None:
             else:
                 why = "commanded, not measured"
         if why:
-            read[name] = Reading("", "", why)
+            read[name] = Meaning("", "", why)
 
 
 # --- our names and units -------------------------------------------------------------------------------------------
@@ -376,14 +376,14 @@ def _leave_out(read: Readings, targets: bool) -> None:
 
 def _under_our_names(
     table: Columns,
-    read: Readings,
+    read: Meanings,
     kind: Measurement,
     known: Mapping[str, Sequence[str]],
     units: Mapping[str, tuple[str, str]],
-) -> tuple[dict[str, Sequence[Any]], list[Meant]]:
+) -> tuple[dict[str, Sequence[Any]], list[Column]]:
     """Return columns under canonical names and their meanings; ``units`` by stem or dimension, and who says so."""
     columns: dict[str, Sequence[Any]] = {}
-    meant: list[Meant] = []
+    meant: list[Column] = []
     stems: dict[str, Sequence[str]] = {**dict.fromkeys(text_columns(kind), ()), **known}
     dimensions = {stem: list(filter(None, each)) for stem, each in stems.items()}
     if not {each.stem for each in read.values()} & {"qw", "rx", "r11"}:  # an uncertainty of all axes is one of lengths
@@ -392,7 +392,7 @@ def _under_our_names(
         stem, _, reason, _ = read[name]
         if stem not in dimensions:
             unused = reason and stem and "not used by this robot and measurement type"
-            meant.append(Meant(name, "not used", "", "", unused or reason or "an unknown name"))
+            meant.append(Column(name, "not used", "", "", unused or reason or "an unknown name"))
             continue
         unit, why = _unit(name, read[name], dimensions[stem], units)
         if unit and UNITS[unit].dimension not in dimensions[stem]:
@@ -405,7 +405,7 @@ def _under_our_names(
             raise InputError("the header", f"columns '{other}' and '{name}' for {new}", accepted)
         columns[new] = cells
         words_of_column = kind.words.columns.get(stem) or meaning(stem)
-        meant.append(Meant(name, words_of_column, new, unit, f"{reason}; unit {why}" if why else reason))
+        meant.append(Column(name, words_of_column, new, unit, f"{reason}; unit {why}" if why else reason))
     unitless = {each.column: dimensions[each.name][0] for each in meant if dimensions.get(each.name)}
     if unitless:
         missing = ",".join(DISPLAY.get(dimension, dimension) for dimension in dict.fromkeys(unitless.values()))
@@ -425,7 +425,7 @@ def meaning(stem: str) -> str:
     return next((match.expand(words) for match, words in matches if match), f"measured {stem}")
 
 
-def _unit(name: str, read: Reading, dimensions: Sequence[str], units: Mapping[str, tuple[str, str]]) -> tuple[str, str]:
+def _unit(name: str, read: Meaning, dimensions: Sequence[str], units: Mapping[str, tuple[str, str]]) -> tuple[str, str]:
     """Return a column's unit and why: its own, the stated one, that of its dialect."""
     if read.unit:
         return read.unit, "in the header"
@@ -454,7 +454,7 @@ def row_stems(robot: Robot, kind: Measurement) -> dict[str, set[str]]:
     return {"measured": {*kind.columns, *forms}, "joint": {f"q{i}" for i in range(1, robot.dof + 1)}}
 
 
-def _rows_with_values(table: Understood, robot: Robot, kind: Measurement) -> Understood:
+def _rows_with_values(table: CanonicalTable, robot: Robot, kind: Measurement) -> CanonicalTable:
     """Return the rows that have measured and joint values, with unique labels, and notes on what was changed."""
     labels = table.labels
     out: set[int] = set()
