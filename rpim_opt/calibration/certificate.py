@@ -70,10 +70,10 @@ def certified(
     except NoSolutionFound:
         return Certificate(float("inf"), violation)
     step = float(np.linalg.norm(best - z) / (1 + np.linalg.norm(z)))
-    promised = objective - program.objective(best, weight)
-    if not np.isfinite(promised):
+    predicted = objective - program.objective(best, weight)
+    if not np.isfinite(predicted):
         return Certificate(step, violation)
-    return Certificate(step, violation, float(max(promised, 0.0) / max(abs(objective), floor, TINY)))
+    return Certificate(step, violation, float(max(predicted, 0.0) / max(abs(objective), floor, TINY)))
 
 
 def _differentiated(model: LinearModel, residual: Callable[[Array], Array], z: Array) -> LinearModel:

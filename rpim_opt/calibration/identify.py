@@ -231,14 +231,14 @@ def ending(ended: Ended, most: int) -> str:
         if state.far:
             text += f" D{exceeded}"
         return " ".join(filter(None, [text, state.choice.note]))
-    if state.outcome == "rest":
+    if state.outcome == "converged":
         decrease = ended.certificate.decrease
         why = f"the constraints are violated by {ended.certificate.violation:.1g} prior standard deviations."
         if decrease is None:
             why = "the final convex program could not be solved again, so the solution is not certified."
         elif decrease > DECREASE:
             why = f"the final convex program still predicts a decrease of the objective by {100 * decrease:.1g} %."
-    elif state.outcome == "stuck":
+    elif state.outcome == "stalled":
         why = (
             "no step, however short, decreases the nonlinear objective; the formulation may have no minimum "
             "here, or the start is far from it."

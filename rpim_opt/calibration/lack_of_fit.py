@@ -79,12 +79,12 @@ class Autocorrelation(NamedTuple):
 class LackOfFit:
     """Components of a calibration's residuals, as RMS of vectors over the rows [m; rad or px without lengths].
 
-    ``residual_dof`` are residual degrees of freedom of the ``equations``; below 6 nothing else is judged. ``left`` is
-    the RMS of the errors; ``instrument`` (as stated or estimated), ``position`` (the robot's repeatability in position,
+    ``residual_dof`` are residual degrees of freedom of the ``equations``; below 6 there is no more. ``residual`` is the
+    RMS of the errors; ``instrument`` (as stated or estimated), ``position`` (the robot's repeatability in position,
     without lengths in orientation) and ``joint`` are the noise's parts, ``repeatable`` is what the extensions
     ``missing`` would explain: a ``share`` of the mean square residual, -2 ln L falling by ``gain``; ``parameters`` are
     the patterns that identify them. ``present`` says by how much -2 ln L falls with each extension of the model.
-    ``alike`` is the autocorrelation of the residuals with all that is missing, None for too few; ``upward`` are joints
+    ``autocorrelation`` is that of the residuals with all that is missing, None for too few; ``upward`` are joints
     whose compliance is significantly negative, which gravity cannot do. ``repeated`` is the RMS of repeated readings
     about their mean, None without enough, ``excess`` that of the residuals beyond, where it is more than chance.
     ``overstated``: the residuals are smaller than the stated noise, by the chi-squared test (`NoiseTest`).
@@ -94,7 +94,7 @@ class LackOfFit:
     equations: int
     residual_dof: float
     dimension: str
-    left: float
+    residual: float
     instrument: float = 0.0
     position: float = 0.0
     joint: float = 0.0
@@ -104,7 +104,7 @@ class LackOfFit:
     gain: float = 0.0
     share: float = 0.0
     present: Mapping[str, float] = field(default_factory=dict)
-    alike: Autocorrelation | None = None
+    autocorrelation: Autocorrelation | None = None
     upward: tuple[int, ...] = ()
     repeated: float | None = None
     excess: float = 0.0
@@ -118,7 +118,7 @@ class LackOfFit:
     @property
     def correlated(self) -> bool:
         """Whether residuals of neighbouring configurations are significantly correlated."""
-        return self.alike is not None and self.alike.z > CORRELATED
+        return self.autocorrelation is not None and self.autocorrelation.z > CORRELATED
 
     @property
     def alarming(self) -> bool:
@@ -127,7 +127,7 @@ class LackOfFit:
 
     def sentences(self) -> list[str]:
         """Return the paragraph, sentence by sentence."""
-        rms = f"Residual RMS per reading {_size(self, self.left)}"
+        rms = f"Residual RMS per reading {_size(self, self.residual)}"
         if not self.instrument:
             count = max(round(self.residual_dof), 0)
             degrees = "1 degree of freedom is" if count == 1 else f"{count} degrees of freedom are"
@@ -167,13 +167,13 @@ class LackOfFit:
         """Return the same as a document [mm, mrad or px]."""
         unit, si = UNITS[self.dimension]
         document = dict(vars(self))
-        for key in ("left", "instrument", "position", "joint", "repeatable", "repeated", "excess"):
+        for key in ("residual", "instrument", "position", "joint", "repeatable", "repeated", "excess"):
             size = document.pop(key)
             document[f"{key}_{unit}"] = None if size is None else size / si
         document["identify"] = list(document.pop("parameters"))
         del document["overstated"]  # which a sentence says
-        alike = self.alike and self.alike._asdict()
-        return {**document, "alike": alike, "alarming": self.alarming, "text": self.sentences()}
+        autocorrelation = self.autocorrelation and self.autocorrelation._asdict()
+        return {**document, "autocorrelation": autocorrelation, "alarming": self.alarming, "text": self.sentences()}
 
 
 @one_blas_thread
@@ -190,7 +190,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
         "equations": len(compared.row),
         "residual_dof": compared.residual_dof,
         "dimension": dimension,
-        "left": float(np.sqrt(np.nanmean(problem.errors(result.x, dimension) ** 2))),
+        "residual": float(np.sqrt(np.nanmean(problem.errors(result.x, dimension) ** 2))),
     }
     if compared.residual_dof < FEWEST:
         return LackOfFit(**known)
@@ -221,7 +221,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
         gain=compared.plain.point.value - best.point.value,
         share=share,
         present=present,
-        alike=_residual_autocorrelation(compared, best),
+        autocorrelation=_residual_autocorrelation(compared, best),
         upward=_upward(compared, present),
         repeated=again,
         excess=excess,
@@ -345,11 +345,11 @@ def _size(found: LackOfFit, value: float) -> str:
 
 def _limit(found: LackOfFit) -> str:
     """Say what limits the result: an effect that the model lacks, the robot or the instrument."""
-    if found.correlated and found.alike is not None:
+    if found.correlated and found.autocorrelation is not None:
         even = "Even then, residuals" if found.missing else "Residuals"
         return (
-            f"{even} of neighbouring configurations are correlated ({found.alike.correlation:.2f}, z = "
-            f"{found.alike.z:.0f}): the model lacks an effect, which averaging more readings does not remove."
+            f"{even} of neighbouring configurations are correlated ({found.autocorrelation.correlation:.2f}, z = "
+            f"{found.autocorrelation.z:.0f}): the model lacks an effect, which averaging more readings does not remove."
         )
     if found.robot > GROSS * found.instrument:
         return "No robot has such poor repeatability: check units, signs, frames and rows first."

@@ -21,9 +21,9 @@ from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem, around
 
-GAIN_GOOD, GAIN_POOR = 0.75, 0.25  # actual over promised decrease above which damping shrinks, below which it grows
+GAIN_GOOD, GAIN_POOR = 0.75, 0.25  # actual over predicted decrease above which damping shrinks, below which it grows
 DAMPING_GROWTH, DAMPING_SHRINK, DAMPING_FIRST, DAMPING_LEAST = 4.0, 0.5, 1.0, 1e-4
-"""Factors; the first damping term over the promised decrease; the ratio below which it is dropped."""
+"""Factors; the first damping term over the predicted decrease; the ratio below which it is dropped."""
 CURVATURE, CURVATURE_STEP, CURVATURE_TURN = 0.1, 0.1, 0.75
 """Curvature over the step's effect from which a step follows it; share of the step at which it is measured; the most
 that it may turn the step."""
@@ -201,7 +201,7 @@ class State:
 
     ``size`` (n,) is the largest norm that each column of A has had, ``damping`` the weight of |size (step)|^2.
     ``stalled`` counts the evaluations since the objective was last lowered beyond its accuracy, to ``lowest``.
-    ``outcome`` says why the loop ended (``"rest"``, ``"stuck"``, ``"far"``), ``floor`` is what vanishing objectives are
+    ``outcome`` is how the loop ended (``"converged"``, ``"stalled"``, ``"far"``), ``floor`` what a vanishing one is
     compared with.
     """
 
@@ -316,7 +316,7 @@ class Loop:
 
     def confirmed(self, state: State) -> State:
         """Apply the rule once more at convergence: a weight is final if the rule selects it again."""
-        if state.outcome != "rest" or state.choice.final:
+        if state.outcome != "converged" or state.choice.final:
             return state
         choice = state.choice.confirmed(self._judged(state))
         if choice.weight == state.choice.weight:
@@ -353,30 +353,30 @@ class Loop:
             # hardly identified directions, which damping bounds
             return replace(state, damping=DAMPING_GROWTH * state.damping, evaluations=state.evaluations + 1)
         choice, length = state.choice, state.relative(float(np.linalg.norm(solution - state.z)))
-        promised = state.merit - state.program.objective(solution, choice.weight)
+        predicted = state.merit - state.program.objective(solution, choice.weight)
         accuracy, best = self._accuracy(state)
-        short, nothing = length <= self.options.tolerance, promised <= accuracy
+        short, nothing = length <= self.options.tolerance, predicted <= accuracy
         if state.damping > 0 and (short or nothing) and state.stalled < STALLED_MOST:
             return replace(state, damping=0.0)  # a short step of a damped program says nothing: ask for the full one
-        at_rest = promised <= best or state.stalled >= (STALLED if nothing else STALLED_MOST)
+        at_rest = predicted <= best or state.stalled >= (STALLED if nothing else STALLED_MOST)
         if choice.settled and at_rest:
-            return replace(state, outcome="rest")
+            return replace(state, outcome="converged")
         waiting = choice.settled and not choice.final and not choice.weights
         if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
             return self.selected(state)
-        return self._stepped(state, solution, promised, short, accuracy)
+        return self._stepped(state, solution, predicted, short, accuracy)
 
-    def _stepped(self, state: State, solution: Array, promised: float, short: bool, accuracy: float) -> State:
+    def _stepped(self, state: State, solution: Array, predicted: float, short: bool, accuracy: float) -> State:
         """Step to a minimum if the nonlinear objective falls, else damp; one below ``accuracy`` promises nothing."""
         z = self._accelerated(state, solution)
         candidate = state.program.on(self.linearized(z, state.z))
         after = candidate.objective(z, state.choice.weight)
         rounding = ROUNDING * abs(state.merit) + state.floor
-        fall, gain, nothing = state.merit - after, 1.0, promised <= accuracy
-        if promised > 0 and not (nothing and abs(fall) <= rounding):  # else rounding would damp
-            gain = fall / promised
+        fall, gain, nothing = state.merit - after, 1.0, predicted <= accuracy
+        if predicted > 0 and not (nothing and abs(fall) <= rounding):  # else rounding would damp
+            gain = fall / predicted
         effect = float(np.sum((state.size * (z - state.z)) ** 2))
-        damping = damped(state.damping, gain, promised, effect)
+        damping = damped(state.damping, gain, predicted, effect)
         state = replace(state, evaluations=state.evaluations + 1, stalled=state.stalled + 1)
         if after < state.lowest - accuracy:
             state = replace(state, stalled=0, lowest=after)
@@ -384,11 +384,11 @@ class Loop:
             return replace(self._accepted(state, candidate, z, after, short), damping=damping)
         state = replace(state, damping=damping)
         if (short or nothing) and state.choice.settled:
-            return replace(state, outcome="rest")
+            return replace(state, outcome="converged")
         if short or nothing:
             return replace(state, choice=state.choice.after(0.0))
         if damping > DAMPING_MOST or not np.isfinite(damping):
-            return replace(state, outcome="stuck")
+            return replace(state, outcome="stalled")
         return state
 
     def _solved(self, program: Program, state: State) -> Array:
@@ -436,12 +436,12 @@ class Loop:
             merit=after,
             history=(*state.history, passed),
             size=np.maximum(state.size, np.linalg.norm(candidate.model.A, axis=0)),
-            outcome="rest" if state.choice.settled and short else "",
+            outcome="converged" if state.choice.settled and short else "",
         )
         return replace(there, choice=state.choice.after(there.relative(length)))
 
     def _accuracy(self, state: State) -> tuple[float, float]:
-        """Return the promised decrease that is none when it comes again and again, and that which is none at once."""
+        """Return the predicted decrease that is none when it comes again and again, and that which is none at once."""
         exact = state.program.quadratic and state.program.box is not None
         size = max(abs(state.merit), state.floor)
         if exact and self.reweigh is None:
@@ -465,7 +465,7 @@ class Ended:
     @property
     def converged(self) -> bool:
         """Whether the loop converged to a solution that the certificate confirms."""
-        return self.settled and self.state.outcome == "rest" and self.certificate.holds(self.state.z)
+        return self.settled and self.state.outcome == "converged" and self.certificate.holds(self.state.z)
 
 
 def minimize(
@@ -519,12 +519,12 @@ def _certified(loop: Loop, problem: Source, state: State) -> Ended:
     return Ended(state, loop.scale * state.z, certificate)
 
 
-def damped(damping: float, gain: float, promised: float, effect: float) -> float:
-    """Return the weight of the damping term after a step, from its gain ratio, promised decrease and effect."""
-    if gain < GAIN_POOR and effect > 0 and promised > 0:
-        return DAMPING_GROWTH * damping if damping else DAMPING_FIRST * promised / effect
+def damped(damping: float, gain: float, predicted: float, effect: float) -> float:
+    """Return the weight of the damping term after a step, from its gain ratio, predicted decrease and effect."""
+    if gain < GAIN_POOR and effect > 0 and predicted > 0:
+        return DAMPING_GROWTH * damping if damping else DAMPING_FIRST * predicted / effect
     if gain > GAIN_GOOD:
         damping = DAMPING_SHRINK * damping
-        if damping * effect <= DAMPING_LEAST * promised:
+        if damping * effect <= DAMPING_LEAST * predicted:
             return 0.0
     return damping

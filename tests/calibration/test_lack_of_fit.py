@@ -54,7 +54,7 @@ def test_clean_arm_is_left_alone_and_its_noise_named():
     assert found.robot < 0.6 * found.instrument
     assert found.share == found.gain == found.repeatable == 0.0
     assert "would explain" not in str(found)
-    fine = LackOfFit(60, 180, 150.0, "length", left=1e-4, instrument=1e-4, position=2e-5)
+    fine = LackOfFit(60, 180, 150.0, "length", residual=1e-4, instrument=1e-4, position=2e-5)
     assert "only a more accurate one" in str(fine)
     assert "only a more accurate one" not in str(replace(fine, position=4e-5))
     assert "mm, repeatability 0.04 mm" in str(replace(fine, position=4e-5))
@@ -82,7 +82,7 @@ def test_division_adds_up_to_what_the_model_without_the_extension_leaves():
     total = found.instrument**2 + found.robot**2 + found.repeatable**2
     assert found.repeatable**2 / total == pytest.approx(found.share, rel=1e-9)
     # of 75 equations 2 in 5 serve the parameters
-    assert found.left * np.sqrt(found.equations / found.residual_dof) == pytest.approx(np.sqrt(total), rel=0.2)
+    assert found.residual * np.sqrt(found.equations / found.residual_dof) == pytest.approx(np.sqrt(total), rel=0.2)
 
 
 def test_model_that_has_gravity_says_so():
@@ -157,7 +157,7 @@ def test_noise_declared_far_too_large_is_said():
 
 
 def test_gross_errors_are_no_repeatability():
-    rough = LackOfFit(60, 180, 150.0, "length", left=0.07, instrument=1e-4, position=0.07)
+    rough = LackOfFit(60, 180, 150.0, "length", residual=0.07, instrument=1e-4, position=0.07)
     assert "units, signs, frames" in str(rough)
     assert "Repeat five" not in str(rough)
     assert "Repeat five" in str(replace(rough, position=0.02))
@@ -169,7 +169,7 @@ def test_blunders_are_not_taken_for_physics():
     y[[3, 17]] += 0.004
     found = lack_of_fit(ro.calibrate(problem.on(ro.Dataset.of(problem.data.q, y, NOISE)), ro.robust, ro.reml))
     assert not found.alarming
-    assert found.left < 2 * ROOT3 * NOISE
+    assert found.residual < 2 * ROOT3 * NOISE
 
 
 def test_paragraph_of_a_file_is_that_of_the_result(tmp_path):
@@ -200,7 +200,7 @@ def test_the_quick_look_leaves_out_what_the_calibration_leaves_out():
     assert [row.label for row in outliers] == [spoiled.labels[5]]
     assert outliers[0].error == pytest.approx(0.008, rel=0.1)
     assert quick is not None
-    assert quick.left < 2 * ROOT3 * NOISE
+    assert quick.residual < 2 * ROOT3 * NOISE
 
 
 def test_what_did_not_converge_is_not_judged():
@@ -211,15 +211,15 @@ def test_document_has_what_the_sentences_say():
     found = lack_of_fit(learned(1, compliance=BENT))
     document = found.content()
     assert document["text"] == found.sentences()
-    assert document["left_mm"] == pytest.approx(1e3 * found.left)
+    assert document["residual_mm"] == pytest.approx(1e3 * found.residual)
     assert document["identify"] == list(found.parameters)
     assert document["alarming"] is True
 
 
 def test_angles_alone_are_told_in_mrad():
-    found = LackOfFit(20, 60, 30.0, "angle", left=1e-4, instrument=1e-4)
+    found = LackOfFit(20, 60, 30.0, "angle", residual=1e-4, instrument=1e-4)
     assert "0.1 mrad" in str(found)
-    assert "left_mrad" in found.content()
+    assert "residual_mrad" in found.content()
 
 
 def test_neighbours_that_share_an_effect_are_alike_and_others_are_not():

@@ -79,19 +79,19 @@ def test_a_rule_is_asked_next_to_where_the_first_weight_leads(away: float, dampi
 
 
 def test_at_rest_a_weight_is_asked_for_once_more() -> None:
-    def resting(*weights: float, outcome: str = "rest") -> State:
+    def resting(*weights: float, outcome: str = "converged") -> State:
         choice = weight_choice(answering(2.0, *weights), True).updated(state().program).after(0.0)
         return state(choice=choice, z=np.ones(N), merit=-1.0, outcome=outcome, stalled=2)
 
     same = loop().confirmed(resting(2.0))
-    assert (same.outcome, same.merit, same.choice.final, same.stalled) == ("rest", -1.0, True, 2)
+    assert (same.outcome, same.merit, same.choice.final, same.stalled) == ("converged", -1.0, True, 2)
     other = loop().confirmed(resting(5.0))
     assert (other.outcome, other.choice.weight, other.choice.settled, other.stalled) == ("", 5.0, False, 0)
     assert other.merit == pytest.approx(other.program.objective(other.z, 5.0), rel=1e-12)
-    for outcome in ("", "stuck"):
+    for outcome in ("", "stalled"):
         going = resting(outcome=outcome)
         assert loop().confirmed(going) is going
-    final = state(outcome="rest")
+    final = state(outcome="converged")
     assert loop().confirmed(final) is final
 
 
@@ -191,7 +191,7 @@ def test_at_its_minimum_a_damped_state_asks_for_the_full_step_and_then_rests() -
     for _ in range(4):
         if not end.outcome:
             end = loop().advanced(end)
-    assert end.outcome == "rest"
+    assert end.outcome == "converged"
     assert end.z == pytest.approx(z, abs=1e-7)
 
 
@@ -208,15 +208,15 @@ def test_a_stalled_loop_rests_at_a_step_that_promises_nothing_and_later_at_any()
     assert 1e-10 * best < there.merit - best < 0.5e-8 * best
     at = loop(formulation=ro.lasso, tolerance=0.0)
     third = at.advanced(replace(there, stalled=2))
-    assert (third.outcome, third.evaluations) == ("rest", there.evaluations)
+    assert (third.outcome, third.evaluations) == ("converged", there.evaluations)
     second = at.advanced(replace(there, stalled=1))
     assert (second.outcome, second.evaluations) == ("", there.evaluations + 1)
-    assert at.advanced(replace(there, merit=best, stalled=0)).outcome == "rest"
+    assert at.advanced(replace(there, merit=best, stalled=0)).outcome == "converged"
     promising = replace(there, merit=best * (1 + 1e-7), lowest=best * (1 + 1e-7))
     assert at.advanced(replace(promising, stalled=2)).stalled == 0
-    assert at.advanced(replace(promising, stalled=20)).outcome == "rest"
+    assert at.advanced(replace(promising, stalled=20)).outcome == "converged"
     assert at.advanced(replace(there, damping=1e9, stalled=19)).damping == 0.0
-    assert at.advanced(replace(there, damping=1e9, stalled=20)).outcome == "rest"
+    assert at.advanced(replace(there, damping=1e9, stalled=20)).outcome == "converged"
 
 
 # --- what is said ------------------------------------------------------------------------------------------
@@ -230,7 +230,7 @@ def unfinished(most: int, history: tuple[Iteration, ...]) -> str:
 
 
 def uncertified(evidence: Certificate) -> str:
-    return ending(Ended(state(outcome="rest"), np.zeros(N), evidence), 8)
+    return ending(Ended(state(outcome="converged"), np.zeros(N), evidence), 8)
 
 
 def test_why_passes_ran_out() -> None:

@@ -69,7 +69,7 @@ LACKING = {"missing": ("gravity",), "parameters": ("compliance?",)}
 
 
 def left(rms: float, **more: Any) -> LackOfFit:
-    return LackOfFit(**PLAIN, left=rms, **more)
+    return LackOfFit(**PLAIN, residual=rms, **more)
 
 
 LEFT: dict[str, tuple[LackOfFit, str, str]] = {
@@ -82,11 +82,11 @@ LEFT: dict[str, tuple[LackOfFit, str, str]] = {
         "would explain",
     ),
     "alike": (
-        left(2e-4, instrument=1e-4, alike=Autocorrelation(0.5, 9.0)),
+        left(2e-4, instrument=1e-4, autocorrelation=Autocorrelation(0.5, 9.0)),
         "Residuals of neighbouring configurations are correlated", "Even then",
     ),
     "alike even then": (
-        left(2e-4, instrument=1e-4, alike=Autocorrelation(0.5, 9.0), **LACKING),
+        left(2e-4, instrument=1e-4, autocorrelation=Autocorrelation(0.5, 9.0), **LACKING),
         "Even then, residuals of neighbouring configurations are correlated (0.50, z = 9): the model lacks an effect, "
         "which averaging more readings does not remove.",
         "Residuals of",
@@ -114,7 +114,7 @@ def test_what_is_left_is_said(what: str) -> None:
     assert unsaid not in str(found)
     content = found.content()
     assert content["text"] == found.sentences()
-    assert content["left_mm"] == pytest.approx(1e3 * found.left)
+    assert content["residual_mm"] == pytest.approx(1e3 * found.residual)
     if found.repeated is None:
         assert content["repeated_mm"] is None
     else:

@@ -121,7 +121,7 @@ def test_a_weight_is_said_with_where_it_came_from() -> None:
 @pytest.mark.parametrize(("count", "said"), [(0, "0 iterations"), (1, "1 iteration"), (2, "2 iterations")])
 def test_passes_are_counted(count: int, said: str) -> None:
     good, bad = Certificate(0.0, 0.0, 0.0), Certificate(1.0, 0.0, 0.5)
-    before = state(history=(None,) * count, outcome="rest")
+    before = state(history=(None,) * count, outcome="converged")
 
     def said_of(at: State, evidence: Certificate = good, most: int = 500) -> str:
         return ending(Ended(at, at.z, evidence), most)
@@ -129,7 +129,7 @@ def test_passes_are_counted(count: int, said: str) -> None:
     assert said_of(before) == f"Converged after {said}."
     noted = replace(before, choice=replace(before.choice, note="It alternates."))
     assert said_of(noted) == f"Converged after {said}. It alternates."
-    assert "no step, however short, decreases the nonlinear objective" in said_of(replace(before, outcome="stuck"))
+    assert "no step, however short, decreases the nonlinear objective" in said_of(replace(before, outcome="stalled"))
     assert "still predicts a decrease of the objective by 5e+01 %" in said_of(before, bad)
     ended = said_of(replace(before, outcome="", history=()), most=7)
     assert ended == "Not converged: 7 iterations were not enough; allow more (max_iterations)."

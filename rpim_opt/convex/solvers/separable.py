@@ -224,12 +224,12 @@ class Newton:
             chord = weight * (self.canonical.value(ahead) - self.canonical.value(self.x))
             u = T @ d
             pull, bend = (0.0, 0.0) if self.damping is None else self.damping.along(z, d)
-            promised = -(gradient @ u + 0.5 * u @ H @ u + chord + pull + 0.5 * bend)
+            predicted = -(gradient @ u + 0.5 * u @ H @ u + chord + pull + 0.5 * bend)
             if self.point.iterations:  # Clarabel's accuracy
                 tolerance = max(tolerance, INTERIOR)
-            if promised < -INEXACT * size and promised < -INEXACT * abs(self._total(r)):
+            if predicted < -INEXACT * size and predicted < -INEXACT * abs(self._total(r)):
                 raise np.linalg.LinAlgError("the subproblem was not solved to a minimum")
-            if promised <= tolerance * size:
+            if predicted <= tolerance * size:
                 break
             Ad = self.rows.A @ d
             t, left = self._search(r, Ad, chord + pull, bend, h, float(gradient @ u) + chord + pull)
@@ -241,7 +241,7 @@ class Newton:
             r = r + t * Ad
             self.x = self.x + t * (ahead - self.x)
             # the model's error along the step says what the next one could gain
-            if (t == 1.0 and promised * left**2 <= 0.01 * tolerance * size) or t * np.abs(d).max() < 1e-15:
+            if (t == 1.0 and predicted * left**2 <= 0.01 * tolerance * size) or t * np.abs(d).max() < 1e-15:
                 break
         return z
 
@@ -335,11 +335,11 @@ class Newton:
             old, new = self.loss.values(v)[near].sum(), self.loss.values(v_ahead)[near].sum()
             u = T @ d
             chord = self._others(ahead, point.x) - self._others(z, x)
-            promised = -(gradient @ u + 0.5 * u @ H @ u + chord + new - old)
+            predicted = -(gradient @ u + 0.5 * u @ H @ u + chord + new - old)
             there = self._value(ahead, point.x)
             if there <= value:
                 z, value, x, best = ahead, there, point.x, point
-            if promised <= 1e-9 * max(abs(value), 1e-9):
+            if predicted <= 1e-9 * max(abs(value), 1e-9):
                 self.x, self.point = x, best
                 return z
             curved = np.abs(self.loss.slope(v_ahead) - self.loss.slope(v)) > 0.1 * self.jump
