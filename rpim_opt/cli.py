@@ -305,7 +305,7 @@ def calibrate(
     problem: Problem,
     variant: Variant = None,
     selector: Annotated[Text, Option(help=RULES)] = None,
-    model: Annotated[Text, Option(help="auto selects extensions; geometry has none.")] = None,
+    model: Annotated[Text, Option(help="Extensions: auto (those that the data support) or geometry (none).")] = None,
     formulation: Annotated[Text, Option(help=READY)] = None,
     noise: Annotated[Text, Option(help=PARTS)] = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
