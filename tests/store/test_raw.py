@@ -455,6 +455,30 @@ def test_a_robot_that_moves_as_it_is_measured_is_named(monkeypatch, capsys, tmp_
     )
 
 
+@pytest.mark.parametrize("late", [0.8, -0.3])
+def test_the_offset_of_a_clock_is_named_by_where_the_robot_stands_still(
+    monkeypatch, capsys, tmp_path, arm, late
+) -> None:
+    """It moves for 2 s, stands still for 1.5 s and more, and is measured 0.75 s after it stopped."""
+    files = [tmp_path / "joints.csv", tmp_path / "points.csv"]
+    starts = np.cumsum(3.5 + np.random.default_rng(0).uniform(0, 1.0, COUNT + 1))
+    log = []
+    for t in np.arange(0, starts[-1], 0.05):
+        k = np.searchsorted(starts, t)
+        log.append([f"{t:.2f}", f"{20 * (k - 1 + min((t - starts[k - 1]) / 2, 1)) if k else 0:.4f}", *["0"] * 5])
+    files[0].write_text(text([["time [s]", *HEAD[1:7]]], log))
+    moments = starts[:-1] + 2.75 + late
+    points = [[name[0], f"{t:.2f}", *point] for name, t, point in zip(NAMED, moments, POINTS, strict=True)]
+    files[1].write_text(text([["Point", "time [s]", *HEAD[7:]]], points))
+    new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.03", "--dry-run")
+    said = capsys.readouterr().out
+    if abs(late) < 0.7:
+        assert "the robot moved" not in said  # within the shortest stop
+        return
+    low, high = re.search(r"It stands still if .* s \((.\d\.\d+) to (.\d\.\d+)\) are added", said).groups()
+    assert float(low) < -late < float(high)
+
+
 def test_rows_without_a_partner_in_time_are_counted(monkeypatch, capsys, tmp_path, arm) -> None:
     files = clocked(tmp_path, rate=100.0, apart=0.003)
     late = [["late", "99000", *POINTS[0]]]

@@ -38,6 +38,9 @@ SIMULTANEOUS = 0.01
 """Times that differ by less than this part of the shortest time between rows are those of one row."""
 LOG, MOVED = 2, 0.01
 """Rows of joints a measured one from which on they are a log, and the change of a joint [deg] that is named."""
+OFFSETS, STILL = np.linspace(-5, 5, 501), 0.02
+"""Offsets of two clocks [s] that are tried, and how long the robot stands still before and after a measurement [s]."""
+RESTING, FEWEST = 0.95, 6  # part of the measured rows at rest with the offset of the clocks, and rows that tell it
 SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """From which number on a time without a unit counts so since 1970: seconds would be in the year 5000."""
 
@@ -305,12 +308,12 @@ def _by_time(joints: CanonicalTable, values: CanonicalTable, key: str, within: f
         f"joined by the nearest time: {len(right)} rows match, of {len(there)} with joints and {len(then)} measured; "
         f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
     ]
-    moved = _motion(joints, there, left, then[right]) if len(there) > LOG * len(right) else np.zeros(1)
+    moved = _motion(joints, there, there[left], then[right]) if len(there) > LOG * len(right) else np.zeros(1)
     if moved.max() > MOVED:
         count = np.count_nonzero(moved > MOVED)
         notes.append(
             f"the robot moved by up to {moved.max():.2g} degrees between measurement and joint values in {count} of "
-            f"{len(right)} joined rows."
+            f"{len(right)} joined rows. {_clocks(joints, there, then[right])}"
         )
     lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right.tolist()))]
     if lonely:
@@ -322,15 +325,31 @@ def _by_time(joints: CanonicalTable, values: CanonicalTable, key: str, within: f
     return Match(left.tolist(), right.tolist(), names, notes, clocks)
 
 
-def _motion(joints: CanonicalTable, times: Array, rows: np.ndarray, moments: Array) -> Array:
-    """Return the largest change (K,) [deg] of a revolute joint from a row's time to its moment, linear between rows."""
+def _clocks(joints: CanonicalTable, times: Array, moments: Array) -> str:
+    """Say what to add to moments (K,) [s] of measurements so that the robot stands still then, if anything does."""
+    when = moments + OFFSETS[:, None]
+    still = (when > times.min()) & (when < times.max()) & (_motion(joints, times, when - STILL, when + STILL) < MOVED)
+    good = np.flatnonzero(still.mean(axis=1) > RESTING)
+    if not len(good) or len(moments) < FEWEST:
+        return "Do the clocks differ (add the offset to the times of one file), or was it measured as it moved?"
+    runs = np.split(good, np.flatnonzero(np.diff(good) > 1) + 1)
+    nearest = OFFSETS[min(runs, key=lambda run: np.abs(OFFSETS[run]).min())]
+    return (
+        f"It stands still if {nearest.mean():+.2g} s ({nearest[0]:+.2f} to {nearest[-1]:+.2f}) are added to the times "
+        "of the measured rows: the clocks differ. Add their offset to the column of times, and join again."
+    )
+
+
+def _motion(joints: CanonicalTable, times: Array, start: Array, end: Array) -> Array:
+    """Return the largest change [deg] of a revolute joint from start to end times [s], linear between rows."""
     order = np.argsort(times)
-    largest = np.zeros(len(rows))
+    largest = np.zeros(start.shape)
     for name, cells in joints.columns.items():
         stem, unit = split_unit(name)
         if re.fullmatch(r"q\d+", stem) and unit and unit.dimension == "angle":
             values = np.degrees(unit.si * np.array([numeral(str(cell)) for cell in cells]))
-            largest = np.fmax(largest, np.abs(np.interp(moments, times[order], values[order]) - values[rows]))
+            before, after = (np.interp(moments, times[order], values[order]) for moments in (start, end))
+            largest = np.fmax(largest, np.abs(after - before))
     return largest
 
 
