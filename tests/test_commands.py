@@ -657,7 +657,9 @@ def test_a_robot_from_ros_base_link_is_written_in_the_controllers_base(tmp_path:
 
 
 def test_another_payload_is_compensated_for(monkeypatch, capsys, tmp_path) -> None:
-    problem, _ = simulated(("a[2-6]", "compliance[23]"), configurations=25, noise=5e-5)
+    gravity = ro.robot.Gravity(masses=(0, 4, 6, 3, 1, 1), centres=((0, 0, 0),) * 6)
+    arm = replace(ARM, gravity=gravity)
+    problem, _ = simulated(("a[2-6]", "compliance[23]"), configurations=25, noise=5e-5, robot=arm)
     result = ro.calibrate(problem, ro.tikhonov, 1.0)
     ro.store.save_result(result, tmp_path / "result.json")
     result = ro.load_result(tmp_path)
@@ -671,6 +673,21 @@ def test_another_payload_is_compensated_for(monkeypatch, capsys, tmp_path) -> No
     for wrong in ("heavy", "-1", "1,2"):
         assert run(monkeypatch, *arguments, str(tmp_path / "out.csv"), "--payload", wrong) != 0
         assert "--payload: found" in capsys.readouterr().err
+
+
+def test_another_payload_needs_masses_of_the_links(monkeypatch, capsys, tmp_path) -> None:
+    """Compliances take up the size of guessed masses, but not that of a payload beside them."""
+    problem, _ = simulated(("a[2-6]", "compliance[23]"), configurations=25, noise=5e-5)
+    result = ro.calibrate(problem, ro.tikhonov, 1.0)
+    ro.store.save_result(result, tmp_path / "result.json")
+    write_csv(tmp_path / "go.csv", [f"q{i}_rad" for i in range(1, 7)], problem.data.q[:6] / 2)
+    arguments = ["compensate", str(tmp_path), str(tmp_path / "go.csv"), "--position-only"]
+    assert run(monkeypatch, *arguments, "--out", str(tmp_path / "out.csv")) == 0
+    assert run(monkeypatch, *arguments, "--out", str(tmp_path / "no.csv"), "--payload", "2.5") == 2
+    assert "2.5 kg, where 0 kg were measured and masses of the links are guessed" in capsys.readouterr().err
+    assert not (tmp_path / "no.csv").exists()
+    with pytest.raises(ro.InputError, match="masses of the links are guessed"):
+        result.predict(problem.data.q, payload=2.5)
 
 
 def test_a_saved_result_compensates_as_the_live_one(monkeypatch, capsys, cell, made, tmp_path) -> None:

@@ -44,7 +44,7 @@ HTML = (".html", ".htm")
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts", ".md", *HTML)
 EXCEL = (".xlsx", ".xlsm", ".ods")
 NUMBERS_OF_ROW = 3  # numbers in a row from which on a sheet is one of measurements
-NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
+NUMERAL = re.compile(r"(?!\d+([.,])(?:\d\d?|\d{4,})\1)[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")  # no 31.05.2026
 NO_NUMBER = re.compile(
     r"(?<=\d)['\u2019\u00a0\u202f](?=\d{3}(?!\d))|±(?=\s*\d)|(?<=\d)[ \t]+#[^\n,;|\t]*$", re.MULTILINE
 )

@@ -28,6 +28,7 @@ from rpim_opt.problem.row_functions import (
     loads_of,
     measured_torques,
     needed,
+    require_known_masses,
     require_loads,
     require_same_torques,
     row_functions,
@@ -257,9 +258,11 @@ class CalibrationProblem(RobotModel):
         the joints bear. Where the data state directions of approach, the column "approach" (N, dof) holds -1, 0 or 1,
         by default 0: the joints are in the middle of their backlash. ``covariance`` is as `Dataset.of` takes it.
         """
-        pick(self.arms, robot, "robot")
+        arm = self.alone(robot)
         q = np.atleast_2d(np.asarray(q, dtype=float))
         N = len(q)
+        if payload is not None:
+            require_known_masses(arm.robot, arm.parameters, arm.data, np.asarray(payload, dtype=float))
         y = np.zeros((N, len(measurement.columns)))
         y[:, [name == "qw" for name in measurement.columns]] = 1.0
         stated = {name: np.asarray(values, dtype=float) for name, values in columns.items()}

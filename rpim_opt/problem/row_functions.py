@@ -283,6 +283,22 @@ def require_same_torques(robot: Robot, parameters: Parameters, before: bool, now
         raise InputError("compliances", f"data {'with' if now else 'without'} joint torques", accepted)
 
 
+def require_known_masses(robot: Robot, parameters: Parameters, data: Dataset, payload: Array) -> None:
+    """Refuse payloads [kg] that were not measured, where masses of the links are guessed.
+
+    Compliances follow from gravity on the links then, and take up how wrong these masses are: not the payload's.
+    """
+    if robot.gravity.masses or measured_torques(data) or not needed(robot, parameters).torques:
+        return
+    carried = [robot.gravity.payload if block.payload is None else block.payload for block in data.blocks]
+    low, high = min(map(np.min, carried)), max(map(np.max, carried))
+    if payload.min() < low or payload.max() > high:
+        measured = " to ".join(dict.fromkeys((f"{low:g}", f"{high:g}")))
+        found = f"{payload.max():g} kg, where {measured} kg were measured and masses of the links are guessed"
+        accepted = "a payload that was measured, or a calibration with mass_kg and centre_x_mm, ... of the links"
+        raise InputError("payload", found, accepted)
+
+
 def repeated(block: Block) -> np.ndarray:
     """Return the number (N,) of what rows measured: the same where joint values and a model's own columns are."""
     seen = [block.columns[name][:, None] for name in block.measurement.depends_on if name in block.columns]

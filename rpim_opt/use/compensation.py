@@ -27,7 +27,13 @@ from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import register, transformed
-from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_same_torques
+from rpim_opt.problem.row_functions import (
+    Loads,
+    loads_on,
+    measured_torques,
+    require_known_masses,
+    require_same_torques,
+)
 from rpim_opt.robot import kinematics
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, call_rows, chain, forward_kinematics, numeric_frame, product
@@ -310,6 +316,7 @@ def compensate(
         count = len(targets.label)
         if mass.shape not in ((), (count,)) or not (mass >= 0).all() or not np.isfinite(mass).all():
             raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {count}")
+        require_known_masses(arm, cell.problem.parameters, cell.problem.data, mass)
         targets = targets._replace(payload=np.broadcast_to(mass, count))
     elif payload is not None or payload_centre is not None:
         raise InputError("payload", "a payload without effect on the model", WEIGHED)

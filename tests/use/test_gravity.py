@@ -25,7 +25,8 @@ TOOL = (0.03, -0.02, 0.06, 0.0, 0.0, 0.0)
 
 
 def arm(mounting: str = "floor", payload: float = 1.0, centre: tuple = (0.0, 0.02, 0.1)) -> ro.robot.Robot:
-    return replace(ARM, gravity=ro.robot.Gravity(payload=payload, payload_centre=centre).mounted(mounting))
+    links = {"masses": (0, 0, 0, 10, 0, 5), "centres": ((0, 0, 0),) * 6}
+    return replace(ARM, gravity=ro.robot.Gravity(**links, payload=payload, payload_centre=centre).mounted(mounting))
 
 
 def table(robot: ro.robot.Robot, identify: tuple[str, ...] = GEOMETRY + EXTENSION) -> ro.robot.Parameters:

@@ -226,3 +226,22 @@ def test_the_command(monkeypatch, capsys, tmp_path) -> None:
     assert text.count("<tr>") == 1 + CHECKS
     assert run(monkeypatch, "monitor", str(tmp_path), str(file), "--out", str(tmp_path / "checks.csv.txt")) == 2
     assert "ends in .html or .csv" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_german_dates_are_no_numbers(decimal: str, monkeypatch, capsys, tmp_path) -> None:
+    """Of five months, by day of the month they would be in another order."""
+    result, data = checked(1, np.where(np.arange(CHECKS) >= 12, 5e-4, 0.0))
+    ro.store.save_result(result, tmp_path / "result.json")
+    block = data.blocks[0]
+    dates = [f"{28 - 3 * (i % 5):02}.{1 + i // 5:02}.2026" for i in range(CHECKS)]
+    dates.sort(key=lambda date: (date[3:5], date[:2]))
+    rows = zip(dates, np.hstack([block.q[:, 0], block.y]), strict=True)
+    lines = ["Datum;" + ";".join([*(f"q{i + 1}_rad" for i in range(6)), "x_m", "y_m", "z_m"])]
+    lines += [";".join([date, *(f"{v:.7f}".replace(".", decimal) for v in row)]) for date, row in rows]
+    (tmp_path / "checks.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    assert run(monkeypatch, "monitor", str(tmp_path), str(tmp_path / "checks.csv"), "--json") == 1
+    document = json.loads(capsys.readouterr().out)
+    assert document["moved"]["name"] == "theta3"
+    assert document["moved"]["first"] == 12
+    assert [row["time"] for row in document["rows"]] == dates
