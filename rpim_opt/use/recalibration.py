@@ -188,9 +188,14 @@ class Update:
             lines.append(f"Changed since then: {joined(moved)}.")
         # a frame that moved explains as much as the link before or behind it (base_z as d1), with more parameters
         least = self.changes[0].gain - AS_GOOD if self.changed else np.inf
-        rivals = [c.name for c in self.causes[1:] if self.changes and (c.probability > RIVAL or c.gain > least)]
+        rivals = [c for c in self.causes[1:] if self.changes and (c.probability > RIVAL or c.gain > least)]
         if rivals:
-            lines.append(f"These readings do not distinguish this from a change of {joined(rivals)}: measure more.")
+            frames = [cause.name for cause in rivals if cause.kind == "frame"]
+            remedy = "measure more."
+            if frames:
+                remedy = f"if the reflector was exchanged or the instrument moved, use --reset '{frames[0]}_*'."
+            names = joined([cause.name for cause in rivals])
+            lines.append(f"These readings do not distinguish this from a change of {names}: {remedy}")
         if self.changes:
             lines.append(f"After these changes: {self.after}.")
         if self.undetermined:

@@ -125,6 +125,19 @@ def test_a_wrong_reading_is_no_change_of_the_robot() -> None:
     assert list(found.result.record.excluded) == [after.label[2]]
 
 
+def test_an_exchanged_reflector_has_its_remedy() -> None:
+    """A reflector 1.5 mm higher looks like a longer last link, whatever is measured; --reset keeps the link."""
+    robot = happened(6, tool_z=1.5e-3)
+    first = ro.calibrate(robot.problem.on(robot.before))
+    found = ro.use.update(first, robot.after)
+    assert "if the reflector was exchanged or the instrument moved, use --reset 'tool_*'." in str(found)
+    again = ro.use.update(first, robot.after, reset=("tool_*",))
+    assert not again.changed
+    d6 = [result.problem.parameters.by_name(result.x)["d6"] for result in (first, found.result, again.result)]
+    assert abs(d6[1] - d6[0]) > 1e-3
+    assert abs(d6[2] - d6[0]) < 1e-5
+
+
 def test_what_moved_of_a_base_that_is_registered_again_is_the_difference_of_its_values() -> None:
     """Deviations of the new result are about other axes."""
     robot = happened(8, base_x=1.5, base_y=-0.8, base_rx=0.7, base_rz=1.0)
