@@ -5,10 +5,11 @@ Annotations are values here: typer reads each of them twice, and as texts they w
 
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
+from importlib import import_module
 from importlib.metadata import entry_points
 from inspect import Parameter, signature
 from pathlib import Path
@@ -106,11 +107,21 @@ def _common(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
+def _completed(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    return lambda incomplete: [name for name in names() if name.startswith(incomplete)]
+
+
 Text = str | None
 Number = float | None
 File = Path | None
 Choice = bool | None
-Problem = Annotated[str, Argument(help="A problem folder, or the name of a shipped one.")]
+SHIPPED = _completed(lambda: sorted(path.parent.name for path in ro.store.problems_folder().glob("*/problem.toml")))
+FORMULATIONS = _completed(lambda: import_module("rpim_opt.convex.formulation").FORMULATIONS)
+SELECTORS = _completed(lambda: ["learned", *import_module("rpim_opt.convex.select").SELECTORS])
+ROBOTS = _completed(lambda: ro.robots())
+MODELS = _completed(lambda: ("auto", "geometry"))
+COMPONENTS = _completed(lambda: ("robot", "free", "level", "declared"))
+Problem = Annotated[str, Argument(help="A problem folder, or the name of a shipped one.", autocompletion=SHIPPED)]
 RULES = "learned (estimated prior scales), or one weight by a rule (reml, l_curve, gcv, k_fold, ...) or a number."
 READY = "least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso."
 PARTS = "Noise to estimate: robot (repeatability), level (factor on the stated noise), free (both), declared (none)."
@@ -246,7 +257,7 @@ def command(function: Callable[..., Output]) -> Callable[..., Output]:
 @command
 def new(
     folder: Annotated[Path, Argument(help="Problem folder to create, or with --chain to extend.")],
-    robot: Annotated[str, Option(help="A ready robot (see rpim-opt robots), or a robot file.")],
+    robot: Annotated[str, Option(help="A ready robot (see rpim-opt robots), or a robot file.", autocompletion=ROBOTS)],
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],
     tables: Tables = TABLES,
     dry_run: Annotated[bool, Option("--dry-run", help="Check everything and write nothing.")] = False,
@@ -304,10 +315,10 @@ def inspect(problem: Problem, variant: Variant = None) -> Output:
 def calibrate(
     problem: Problem,
     variant: Variant = None,
-    selector: Annotated[Text, Option(help=RULES)] = None,
-    model: Annotated[Text, Option(help="Extensions: auto (those that the data support) or geometry (none).")] = None,
-    formulation: Annotated[Text, Option(help=READY)] = None,
-    noise: Annotated[Text, Option(help=PARTS)] = None,
+    selector: Annotated[Text, Option(help=RULES, autocompletion=SELECTORS)] = None,
+    model: Annotated[Text, Option(help="auto: extensions that data support; geometry: none.", autocompletion=MODELS)] = None,
+    formulation: Annotated[Text, Option(help=READY, autocompletion=FORMULATIONS)] = None,
+    noise: Annotated[Text, Option(help=PARTS, autocompletion=COMPONENTS)] = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
     use_validation: Annotated[Choice, Option(help="Refit with validation rows; default: after new --hold-out.")] = None,
     limit: Tolerance = None,

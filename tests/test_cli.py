@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from io import StringIO
 from pathlib import Path
 
@@ -244,3 +247,21 @@ def test_the_list_of_commands_says_each_first_line_whole(monkeypatch, capsys) ->
     for command in cli.app.registered_commands:
         first = command.callback.__doc__.partition("\n\n")[0]
         assert f"{command.callback.__name__} {' '.join(first.split())}" in words
+
+
+@pytest.mark.parametrize(
+    ("words", "incomplete", "value"),
+    [
+        ("rpim-opt calibrate", "pos", "position"),
+        ("rpim-opt calibrate --selector", "re", "reml"),
+        ("rpim-opt calibrate --formulation", "rob", "robust"),
+        ("rpim-opt new --robot", "ur5", "ur5e"),
+    ],
+)
+def test_a_shell_completes_the_values_of_options(words: str, incomplete: str, value: str) -> None:
+    """As bash asks after a tab."""
+    count = len(words.split())
+    asked = {"_RPIM_OPT_COMPLETE": "complete_bash", "COMP_WORDS": f"{words} {incomplete}", "COMP_CWORD": str(count)}
+    command = [sys.executable, "-c", "from rpim_opt.cli import app; app(prog_name='rpim-opt')"]
+    done = subprocess.run(command, env=os.environ | asked, capture_output=True, text=True, timeout=60, check=False)
+    assert value in done.stdout.split()
