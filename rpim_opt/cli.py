@@ -316,7 +316,9 @@ def calibrate(
     problem: Problem,
     variant: Variant = None,
     selector: Annotated[Text, Option(help=RULES, autocompletion=SELECTORS)] = None,
-    model: Annotated[Text, Option(help="auto: extensions that data support; geometry: none.", autocompletion=MODELS)] = None,
+    model: Annotated[
+        Text, Option(help="auto: extensions from the data; geometry: none.", autocompletion=MODELS)
+    ] = None,
     formulation: Annotated[Text, Option(help=READY, autocompletion=FORMULATIONS)] = None,
     noise: Annotated[Text, Option(help=PARTS, autocompletion=COMPONENTS)] = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,

@@ -75,7 +75,7 @@ def run(seed: int, cycles: int, count: int) -> dict[str, Any]:
     for curve in transmission_errors(found):
         error, half = curve.error[curve.inside], curve.standard[curve.inside]
         joint = curve.joint - 1  # ripple is of the model's joint, the curve as the controller counts
-        factor = 1.0 if curve.coupled else arm.problem.robot.joint_map[joint, joint]
+        factor = 1.0 if "coupled" in curve.called else arm.problem.robot.joint_map[joint, joint]
         truth = ripple(factor * curve.q[curve.inside], joint) / factor
         inside = np.abs(error - truth) <= ro.calibration.Uncertainty(found).coverage_factor * half
         sums = {"truth": np.mean(truth**2), "found": np.mean(error**2), "both": np.mean(error * truth)}

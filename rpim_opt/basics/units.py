@@ -142,7 +142,7 @@ def quantities(
         if unit.dimension not in dimensions[stem]:
             raise InputError(place, "no unit of the right dimension", ", ".join(with_unit(stem, *dimensions[stem])))
         if (stem, unit.dimension) in result:
-            raise InputError(place, "the same quantity twice", "one of them")
+            raise InputError(place, f"{stem} twice, in two units", "one of them")
         result[stem, unit.dimension] = _in_si(value, place, unit, lists)
     return result
 

@@ -134,11 +134,6 @@ class Workspace:
     expanded: Array
 
     @property
-    def count(self) -> int:
-        """Number of sampled configurations."""
-        return len(self.q) - 1
-
-    @property
     def largest(self) -> float:
         """Maximum expanded uncertainty [m]."""
         return float(self.expanded[-1])
@@ -156,8 +151,9 @@ class Workspace:
         found = "measured configurations" if self.requirement.measured else "configurations, refined by a search"
         return (
             f"Expanded uncertainty of the position that {reflector} reaches (U, "
-            f"{percent(self.requirement.confidence)}): at most {1e3 * self.largest:.3f} mm (largest of {self.count} "
-            f"{found}), median {1e3 * self.median:.3f} mm; `compensate --tool` states that of another point"
+            f"{percent(self.requirement.confidence)}): at most {1e3 * self.largest:.3f} mm (largest of "
+            f"{len(self.q) - 1} {found}), median {1e3 * self.median:.3f} mm; "
+            "`compensate --tool` states that of another point"
         )
 
 
@@ -306,7 +302,7 @@ class Acceptance:
             "confidence": r.confidence,
             "region": r.where,
             "box_mm": box,
-            "configurations": 0 if workspace is None else workspace.count,
+            "configurations": 0 if workspace is None else len(workspace.q) - 1,
             **{f"{k}_mm": None if v is None or not np.isfinite(v) else 1e3 * v for k, v in lengths.items()},
             "worst": workspace and workspace.q[-1].tolist(),
             "place_mm": workspace and (1e3 * workspace.position[-1]).tolist(),
@@ -416,7 +412,7 @@ def _standing(result: Calibration) -> str:
     """Return a sentence on joints of the robot that hardly moved; empty if all did."""
     (measured,), (robot,) = result.ranges.values(), result.problem.arms.values()
     least = np.array([LEAST_TRAVEL[robot.joint_types[i]] for i in robot.leading])
-    still = [str(i + 1) for i in np.flatnonzero(np.ptp(measured, axis=0) < least)]
+    still = [robot.joint(i) for i in np.flatnonzero(np.ptp(measured, axis=0) < least)]
     if not still:
         return ""
     return f"Joint{'s' * (len(still) > 1)} {joined(still)} did not move: the verdict holds only at the measured values."
@@ -486,7 +482,8 @@ def _held_out(
             + (moved or "Repeat these measurements, or extend the model.")
         )
     noise = 1e3 * instrument[inside].max(initial=0.0)
-    sentence = f"Held out: {rows} rows, {count} of them in the region, maximum error there {largest:.3f} mm "
+    what = "Held out" if data is None else "New measurements"
+    sentence = f"{what}: {rows} rows, {count} of them in the region, maximum error there {largest:.3f} mm "
     sentence += f"(up to {noise:.3f} mm from the instrument alone)"
     if held.coverage is not None:
         share = coverage_text(held.coverage, rows)

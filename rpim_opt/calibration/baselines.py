@@ -59,13 +59,6 @@ def levenberg_marquardt(problem: CalibrationProblem) -> Baseline:
 
     if len(problem.owners) < len(scale):
         raise InputError("data", "fewer equations than parameters", "gauss_newton, or a calibration with a penalty")
-    solution = scipy.optimize.least_squares(
-        lambda z: problem.whitened_residual(scale * z),
-        np.zeros_like(scale),
-        slope,
-        method="lm",
-        xtol=1e-12,
-        ftol=1e-12,
-        max_nfev=200,
-    )
+    how: Any = {"method": "lm", "xtol": 1e-12, "ftol": 1e-12, "max_nfev": 200}
+    solution = scipy.optimize.least_squares(lambda z: problem.whitened_residual(scale * z), 0 * scale, slope, **how)
     return Baseline(scale * solution.x, int(solution.nfev))

@@ -98,12 +98,12 @@ class Inspection(Tabled):
 
     def __str__(self) -> str:
         joints = []
-        for r in self._frame_rows():
+        for i, r in enumerate(self._frame_rows()):
             figures = [f"{value:.2f}" for value in (r["from"], r["to"], r["to"] - r["from"])]
             limits = ["-", "-"]
             if r["limits"]:
                 limits = [f"{r['limits'][0]:.0f} to {r['limits'][1]:.0f}", f"{100 * r['share']:.0f} %"]
-            joints.append([r["joint"], r["unit"], *figures, *limits])
+            joints.append([f"q{self.problem.robot.joint(i)}", r["unit"], *figures, *limits])
         measured = []
         for r in self._measured():
             figures = ["-" if r[k] is None else f"{r[k]:.3f}" for k in ("from", "to")]

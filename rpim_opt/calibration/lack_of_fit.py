@@ -105,7 +105,7 @@ class LackOfFit:
     share: float = 0.0
     present: Mapping[str, float] = field(default_factory=dict)
     autocorrelation: Autocorrelation | None = None
-    upward: tuple[int, ...] = ()
+    upward: tuple[str, ...] = ()
     repeated: float | None = None
     excess: float = 0.0
     overstated: bool = False
@@ -116,14 +116,11 @@ class LackOfFit:
         return float(np.hypot(self.position, self.joint))
 
     @property
-    def correlated(self) -> bool:
-        """Whether residuals of neighbouring configurations are significantly correlated."""
-        return self.autocorrelation is not None and self.autocorrelation.z > CORRELATED
-
-    @property
     def alarming(self) -> bool:
         """Whether a missing effect is reported."""
-        return bool(self.missing or self.upward or self.correlated)
+        return bool(self.missing or self.upward) or (
+            self.autocorrelation is not None and self.autocorrelation.z > CORRELATED
+        )
 
     def sentences(self) -> list[str]:
         """Return the paragraph, sentence by sentence."""
@@ -257,7 +254,7 @@ def _parts(compared: Comparison, model: Candidate, known: Repeatability | None =
     return {kind: float(np.sqrt(total / compared.rows)) for kind, total in squares.items()}
 
 
-def _upward(compared: Comparison, present: Mapping[str, float]) -> tuple[int, ...]:
+def _upward(compared: Comparison, present: Mapping[str, float]) -> tuple[str, ...]:
     """Return the joints that surely turn against gravity, where gravity is worth its parameters."""
     model = compared.best
     # signs of measured torques are the table's, and numbers of joints would not say of which robot
@@ -268,7 +265,7 @@ def _upward(compared: Comparison, present: Mapping[str, float]) -> tuple[int, ..
     z = model.point.z
     moves = np.linalg.norm(model.evidence.data.X[compared.equations] * z, axis=0)
     names = compared.names[compared.members(model.extensions)].tolist()
-    return against_gravity(names, z, np.sqrt(np.diag(model.point.C)), moves)
+    return against_gravity(compared.problem.robot, names, z, np.sqrt(np.diag(model.point.C)), moves)
 
 
 def _repeated(problem: CalibrationProblem, x: Array, dimension: str) -> tuple[float | None, int]:
@@ -345,7 +342,7 @@ def _size(found: LackOfFit, value: float) -> str:
 
 def _limit(found: LackOfFit) -> str:
     """Say what limits the result: an effect that the model lacks, the robot or the instrument."""
-    if found.correlated and found.autocorrelation is not None:
+    if found.autocorrelation is not None and found.autocorrelation.z > CORRELATED:
         even = "Even then, residuals" if found.missing else "Residuals"
         return (
             f"{even} of neighbouring configurations are correlated ({found.autocorrelation.correlation:.2f}, z = "

@@ -117,13 +117,13 @@ def position_budget(result: Outcome, q: Array, marker: str | None = None) -> dic
 class TransmissionError(NamedTuple):
     """Transmission error of a joint (from 1) at values ``q`` (K,), and its standard uncertainty [rad].
 
-    As the controller counts the joint, or the model one that is ``coupled`` to several of the controller's.
+    As the controller counts the joint, or the model one that is coupled to several of its; ``called`` says which.
     ``measured`` are the least and largest measured value [rad], ``effect`` is the RMS of what the error moves in the
     measured lengths [m], ``names`` are those of its coefficients.
     """
 
     joint: int
-    coupled: bool
+    called: str
     q: Array
     error: Array
     standard: Array
@@ -132,7 +132,7 @@ class TransmissionError(NamedTuple):
     names: tuple[str, ...]
 
     def __str__(self) -> str:
-        return f"joint {self.joint}{' of the model (coupled)' if self.coupled else ''}"
+        return f"joint {self.called}"
 
     @property
     def inside(self) -> np.ndarray:
@@ -173,10 +173,11 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
         row = part.robot.joint_map[curve.joint - 1]
         own = np.flatnonzero(row)
         joint, factor = (int(own[0]) + 1, row[own[0]]) if len(own) == 1 else (curve.joint, 1.0)
+        called = part.robot.joint(joint - 1) if len(own) == 1 else f"{joint} of the model (coupled)"
         table = np.array([q / factor, columns @ result.x[place] / factor, np.sqrt(variance) / abs(factor)])
         q, error, standard = table[:, :: int(np.sign(factor))]
         low, high = sorted((end(at[:, curve.joint - 1]) / factor).item() for end in (np.min, np.max))
-        errors.append(TransmissionError(joint, len(own) > 1, q, error, standard, (low, high), effect, names))
+        errors.append(TransmissionError(joint, called, q, error, standard, (low, high), effect, names))
     return errors
 
 

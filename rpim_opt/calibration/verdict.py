@@ -29,7 +29,7 @@ from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
 from rpim_opt.problem.row_functions import measured_torques
-from rpim_opt.robot.mdh import MDH
+from rpim_opt.robot.mdh import MDH, Robot, numbered
 from rpim_opt.robot.parameters import frame_of, own_name
 
 BAD = "Larger than expected"
@@ -166,22 +166,21 @@ def _taking_part(result: Outcome, k: int) -> list[str]:
     Stated is what is not identified, and what prior or constraints hold. What free frames explain is left out first.
     """
     p = result.problem.parameters
-    every = cast(CalibrationProblem, result.problem).identifying(p.identified | p.of_frames)
-    names = np.array(every.parameters.free.names)
-    of_frames, placed = every.parameters.free.of_frames, every.parameters.free.placed
-    mine = np.isin(names, p.free.names)
-    x = np.zeros(len(names))
+    framed = cast(CalibrationProblem, result.problem).identifying(p.identified | p.of_frames)
+    every = framed.parameters.free
+    mine = np.isin(every.names, p.free.names)
+    x = np.zeros(len(mine))
     x[mine] = result.x
-    effects = every.linearize(x).A
+    effects = framed.linearize(x).A
     sizes = np.maximum(np.linalg.norm(effects, axis=0), TINY)
     effects /= sizes
-    stated = ~mine | np.isin(names, result.actively_constrained)
+    stated = ~mine | np.isin(every.names, result.actively_constrained)
     form = result.program.penalty_form
     if form is not None:  # within its prior, what is stated has less effect than the parameter that took its error up
         prior = np.vstack([result.penalty_weight**0.5 * form.matrix, 1e-4 * np.eye(len(result.x))])
         width = np.linalg.norm(np.linalg.pinv(prior), axis=1)
         stated[mine] |= width * sizes[mine] < min(width[k], np.abs(result.z[k])) * sizes[mine][k]
-    free, held = effects[:, of_frames & ~stated], placed & stated
+    free, held = effects[:, every.of_frames & ~stated], every.placed & stated
     left = np.column_stack([effects[:, mine][:, k], effects[:, held]])
     left -= free @ np.linalg.pinv(free, rcond=1e-6) @ left
     own = left[:, 0]
@@ -189,7 +188,7 @@ def _taking_part(result: Outcome, k: int) -> list[str]:
     if np.linalg.norm(own) < ALIKE or np.linalg.norm(own - parts.sum(axis=1)) > ALIKE * np.linalg.norm(own):
         return []
     part = np.linalg.norm(parts, axis=0)
-    return names[held][part > 0.1 * part.max()].tolist()
+    return np.array(every.names)[held][part > 0.1 * part.max()].tolist()
 
 
 def kept_rows(result: Outcome) -> np.ndarray:
@@ -305,19 +304,16 @@ def _deviations(result: Outcome) -> Iterator[str]:
     p = result.problem.parameters
     types = [(robot, *each) for robot, arm in result.problem.arms.items() for each in enumerate(arm.joint_types, 1)]
     zeros = {p.called(robot, f"d{joint}") for robot, joint, kind in types if kind == "prismatic"}
-    worst, said = 1.0, ""
-    for i, (name, x) in enumerate(zip(p.free.names, result.x, strict=True)):
-        kind = own_name(name).rstrip("0123456789")
-        joint = own_name(name).removeprefix(kind)
-        if kind not in MACHINED or not joint or name in zeros:
-            continue
-        unit, largest = MACHINED[kind]
-        if abs(x) / largest > worst:
-            worst = float(abs(x)) / largest
-            said = f"{name} deviates by {three_digits(1e3 * x)} {unit}"
-            said += f": manufacturing errors stay below {1e3 * largest:g} {unit}. {_cause(result, i, largest)}"
-    if said:
-        yield said
+    kinds = [own_name(name).rstrip("0123456789") for name in p.free.names]
+    size = np.zeros(len(kinds))
+    for i, (name, kind) in enumerate(zip(p.free.names, kinds, strict=True)):
+        if kind in MACHINED and kind != own_name(name) and name not in zeros:
+            size[i] = abs(result.x[i]) / MACHINED[kind][1]
+    i = int(size.argmax())
+    if size[i] > 1:
+        unit, largest = MACHINED[kinds[i]]
+        said = f"{p.free.names[i]} deviates by {three_digits(1e3 * result.x[i])} {unit}"
+        yield f"{said}: manufacturing errors stay below {1e3 * largest:g} {unit}. {_cause(result, i, largest)}"
 
 
 def _cause(result: Outcome, i: int, largest: float) -> str:
@@ -333,9 +329,10 @@ def _cause(result: Outcome, i: int, largest: float) -> str:
 def _worse(result: Outcome) -> Iterator[str]:
     """Say that the robot misses rows by more than the nominal one, or that none is left to tell."""
     sentence = worse_than_nominal(result.nominal_errors(), result.errors(), "the identification rows")
-    if sentence:
+    if sentence and result.learned is None:
         tight = ", or constraints are too tight" if result.formulation.constraints else ""
-        yield f"{sentence.removesuffix('.')}: the weight is too large{tight}."
+        sentence = f"{sentence.removesuffix('.')}: the weight is too large{tight}."
+    yield from filter(None, [sentence])
     held, validation = result.record.held_out, result.record.validation
     if held is None and validation is not None:
         held = held_out_errors(result, validation)
@@ -388,16 +385,13 @@ def _computed(result: Outcome) -> Iterator[str]:
         lengths = [i for i, dimension in enumerate(block.measurement.columns.values()) if dimension == "length"]
         decimals = decimals_of(1e3 * block.y[:, lengths]) if lengths else None
         rounding.append(0.0 if decimals is None else 1e-3 * 10.0**-decimals * np.sqrt(len(lengths) / 12))
+    beside = ""
     if nominal < COMPUTED_RMS and noise_ratio(problem, errors) < COMPUTED:
-        yield (
-            f"The error of the nominal robot is {1e3 * nominal:.2g} mm RMS, far below the measurement noise: the "
-            "data seem to be computed from this robot, not measured."
-        )
+        beside = "far below the measurement noise: the data seem to be computed from this robot, not measured."
     elif min(rounding) > 0 and nominal < ROUNDED * max(rounding):
-        yield (
-            f"The error of the nominal robot is {1e3 * nominal:.2g} mm RMS, no more than the rounding of the "
-            "data: they seem to be computed from this robot, or have too few decimals."
-        )
+        beside = "no more than rounding makes: the data seem to be computed from this robot, or have too few decimals."
+    if beside:
+        yield f"The error of the nominal robot is {1e3 * nominal:.2g} mm RMS, {beside}"
 
 
 # --- likely causes ------------------------------------------------------------------------------------------------
@@ -438,7 +432,8 @@ def likely_causes(result: Outcome) -> list[str]:
     if result.mapping is not None:
         shared += result.mapping.ambiguities
     if known:
-        causes, shared = [], [*known, *shared]
+        first_of = ["Correct the one with the largest statistic first: the others may be right."] * (len(known) > 1)
+        causes, shared = [], [*known, *first_of, *shared]
     elif signs or not result.converged:
         causes = _held(result, problem) or _limited_by_formulation(result, problem, kept)
         causes = causes or [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
@@ -588,17 +583,17 @@ def _other_robot(result: Outcome, problem: CalibrationProblem) -> Better | None:
     return sibling(problem)
 
 
-def against_gravity(names: Sequence[str], x: Array, sd: Array, moves: Array) -> tuple[int, ...]:
+def against_gravity(robot: Robot, names: Sequence[str], x: Array, sd: Array, moves: Array) -> tuple[str, ...]:
     """Return the joints that significantly turn against gravity, from x, standard deviations and movements (n,)."""
     joints = {i: int(name.removeprefix("compliance")) for i, name in enumerate(names) if name.startswith("compliance")}
     largest = max((moves[i] for i in joints), default=0.0)
-    return tuple(k for i, k in joints.items() if x[i] < -UPWARD * sd[i] and moves[i] > NOTABLE * largest)
+    upward = [k for i, k in joints.items() if x[i] < -UPWARD * sd[i] and moves[i] > NOTABLE * largest]
+    return tuple(numbered(k - 1, robot.joint_names) for k in upward)
 
 
-def upward_sentence(joints: Sequence[int]) -> str:
+def upward_sentence(joints: Sequence[str]) -> str:
     """Say that joints turn against gravity: the mounting is another one, or a force is not gravity's."""
-    numbers = joined([str(joint) for joint in joints])
-    of = f"compliances of joints {numbers} are" if len(joints) > 1 else f"compliance of joint {numbers} is"
+    of = f"compliances of joints {joined(joints)} are" if len(joints) > 1 else f"compliance of joint {joints[0]} is"
     return (
         f"{of} negative, which gravity cannot cause: check `mounting`, the payload, sag compensation, hoses, springs "
         "and counterweights."
@@ -613,7 +608,7 @@ def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
     if C is None:
         return []
     moves = np.linalg.norm(problem.linearize(x).A * (x / free.scale), axis=0)
-    joints = against_gravity(free.names, x, np.sqrt(np.diag(C)), moves)
+    joints = against_gravity(problem.robot, free.names, x, np.sqrt(np.diag(C)), moves)
     return [upward_sentence(joints)] if joints else []
 
 

@@ -122,8 +122,10 @@ def weight_lines(result: Outcome) -> list[str]:
             text += f", without {last.changed}"
         return [f"Formulation '{name}'.", f"{text}."]
     if result.learned is not None:
+        form = result.program.penalty_form
+        centre = 0.0 if form is None else np.linalg.lstsq(form.matrix, form.c, rcond=None)[0]
         names = result.problem.parameters.free.names
-        return [f"Formulation '{name}'.", *learned_lines(result.learned, names, result.z)]
+        return [f"Formulation '{name}'.", *learned_lines(result.learned, names, result.z, result.z - centre)]
     if result.formulation.penalty is None:
         return [f"Formulation '{name}' has no penalty and needs no weight."]
     if result.selection is None:
@@ -187,9 +189,9 @@ def _outlying(result: Outcome, advised: bool) -> list[str]:
 # --- hyperparameters --------------------------------------------------------------------------------------------
 
 
-def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[str]:
-    """Return sentences on estimated hyperparameters, from names (n,) and z (n,) in local scales."""
-    ratio = np.abs(z) * learned.local
+def learned_lines(learned: Learned, names: tuple[str, ...], z: Array, off: Array) -> list[str]:
+    """Return sentences on estimated hyperparameters, from z and z minus prior mean (n,) in local scales."""
+    ratio = np.abs(off) * learned.local
     unusual = []
     for i in np.argsort(-ratio)[:MOST]:
         if ratio[i] > UNUSUAL:
@@ -356,11 +358,9 @@ def contact_remarks(problem: CalibrationProblem) -> list[str]:
     """Return remarks on what touches show and what they do not; empty if there are none."""
     if problem.touches is None:
         return []
-    nearest = []
-    if not all(problem.touches.planar):
-        nearest.append("the mean of all touches of its point")
-    if any(problem.touches.planar):
-        nearest.append("the best-fit plane of all its touches")
+    planar = problem.touches.planar
+    nearest = ["the mean of all touches of its point"] * (not all(planar))
+    nearest += ["the best-fit plane of all its touches"] * any(planar)
     definition = f"Error of a touch: the modelled distance of the tool from {', or '.join(nearest)}"
     reach = "robots reach" if len(problem.arms) > 1 else "robot reaches"
     consistently = f"the error shows how consistently the {reach} them from all sides"

@@ -1068,7 +1068,8 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
         if left < (best if len(some) == 1 else min(best, MOVED * alone)) and apart.min() >= 1e3 * LOOSE:
             best = left
             units = ["mrad" if free.dimensions[k] == "angle" else "mm" for k in numbers]
-            steps = [f"joint {some[k][0]} by {apart[k]:.2g} {unit}" for k, unit in enumerate(units)]
+            names = [numbered(i - 1, problem.robot.joint_names) for i, _ in some]
+            steps = [f"joint {names[k]} by {apart[k]:.2g} {unit}" for k, unit in enumerate(units)]
             said = f"backlash, {joined(steps)}"
     if said:
         yield (

@@ -18,6 +18,7 @@ from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import joint_columns, printed
+from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
 from rpim_opt.calibration.held_out import coverage_text, headline_errors, rows_used
@@ -42,7 +43,6 @@ from rpim_opt.use.sessions import in_session, session_notes
 from rpim_opt.use.validation import Validation
 
 MOST_FLAGGED = 200  # flagged rows that are named, the worst first
-LONGEST = 60  # characters of an argument of a penalty or constraint that is shown: an earlier result is a matrix
 L_CURVE_HEIGHT = 340.0  # [px], for the label of its axis
 WHY = {"learned": "maximum of the marginal likelihood"}  # reasons of choices that have no note; others were given
 
@@ -357,9 +357,6 @@ def _diagnostics(content: Content) -> Iterator[Block]:
         f"violation {c.violation:.2g} (in prior standard deviations)."
     )
     yield "text", [result.message, text]
-    history = enumerate(result.history, start=1)
-    rows = [[str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"] for k, it in history]
-    yield "table", Table("Iterations", ["iteration", "objective", "step [prior standard deviations]", "weight"], rows)
 
 
 def _identifiability(result: Calibration) -> Iterator[Block]:
@@ -434,19 +431,17 @@ def _provenance(content: Content) -> Iterator[Block]:
 def _formulation(result: Calibration) -> str:
     """Return what is minimized, in the terms of the result's file."""
 
-    def argument(value: Any) -> str:
-        return str(value) if len(str(value)) <= LONGEST else f"{len(value)} rows"
-
     def term(part: Any) -> str:
+        if isinstance(part, list) and part[0] == prior_penalty.__name__:
+            return f"{part[1] or 'none'}, with the stated prior"
         if isinstance(part, list):
-            return f"{argument(part[0])}({', '.join(map(argument, part[1:]))})"
+            return f"{part[0]}({', '.join(map(str, part[1:]))})"
         return part or "a function of a script, not stored in the file"
 
     parts = definition(result.formulation)
     over = "" if parts["penalty_over"] == "none" else f" over {term(parts['penalty_over'])}"
     text = f"loss {term(parts['loss'])} of each {parts['loss_over']}, penalty {term(parts['penalty'])}{over}"
-    bounds = [term(c) for c in parts["constraints"]]
-    return f"{text}, constraints: {', '.join(bounds) or 'none'}"
+    return f"{text}, constraints: {', '.join(map(term, parts['constraints'])) or 'none'}"
 
 
 def _regularization(content: Content) -> Iterator[Block]:

@@ -55,7 +55,7 @@ def test_a_file_that_states_no_size_is_read_no_further_than_it_may_be() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("theta_deg", "theta_rad = 0.1\ntheta_deg", "the same quantity twice, accepted: one of them"),
+        ("theta_deg", "theta_rad = 0.1\ntheta_deg", "theta twice, in two units, accepted: one of them"),
         ('type = "revolute"', 'type = "revolute"\nlimits_deg = [10, -10]', "[lower, upper]"),
         ('type = "revolute"', 'type = "revolute"\nlimits_deg = [10]', "[lower, upper]"),
     ],

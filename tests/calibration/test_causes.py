@@ -710,8 +710,9 @@ def test_backlash_of_one_joint_is_that_of_no_second_one() -> None:
     """Which explains half of what is left by chance: 60 rows have 60 directions."""
     sides = 0.75e-3 * np.random.default_rng(5).choice([-1, 1], 60)
     problem = of_joint(1, lambda q: q + sides)(simulated_arm("irb120", count=60))
+    problem = replace(problem, robots=replace(problem.robot, joint_names=tuple("ABCDEF")))
     (said,) = two_positions(problem, ro.calibrate(problem, ro.tikhonov, 1.0).x, 0.5)
-    assert said.startswith("backlash, joint 2 by 1.5 mrad: one of two positions")
+    assert said.startswith("backlash, joint 2 (B) by 1.5 mrad: one of two positions")
 
 
 def test_backlash_is_named_from_half_a_milliradian_on() -> None:

@@ -102,8 +102,11 @@ LEFT: dict[str, tuple[LackOfFit, str, str]] = {
     ),
     "never repeated": (left(1e-3, instrument=1e-4, position=1e-3), "Repeat five configurations", "backlash"),
     "below the noise": (left(1e-6, instrument=1e-4, overstated=True), "Repeat one reading ten times", "only a more"),
-    "up": (left(1e-4, instrument=1e-4, upward=(2,)), "Compliance of joint 2 is negative", "joints 2"),
-    "both up": (left(1e-4, instrument=1e-4, upward=(2, 3)), "Compliances of joints 2 and 3 are negative", "joint 2 is"),
+    "up": (left(1e-4, instrument=1e-4, upward=("2",)), "Compliance of joint 2 is negative", "joints 2"),
+    "both up": (
+        left(1e-4, instrument=1e-4, upward=("2", "3 (elbow)")),
+        "Compliances of joints 2 and 3 (elbow) are negative", "joint 2 is",
+    ),
 }  # fmt: skip
 
 
@@ -150,7 +153,7 @@ def learned(
 
 
 def said(found: Learned) -> list[str]:
-    return words.learned_lines(found, ("theta2", "d3"), np.zeros(2))
+    return words.learned_lines(found, ("theta2", "d3"), np.zeros(2), np.zeros(2))
 
 
 def test_what_was_learned_is_said_and_nothing_else() -> None:

@@ -130,6 +130,19 @@ def test_a_stated_tool_beside_the_last_axis_looks_like_its_joint_zero() -> None:
     assert "an error of the stated tool_x: check it." in verdict.caution
 
 
+def test_of_known_values_that_are_contradicted_the_wrong_one_comes_first() -> None:
+    """Without the right one the last joint turns; estimated scales are no weight that was too large."""
+    problem = ro.load("position").problem
+    known = ro.bayes.Prior.known("tool_x = 15 +- 0.02 mm") & ro.bayes.Prior.known("tool_y = -3.7 +- 0.02 mm")
+    *before, x, y, order = ro.calibrate(problem, prior=known).verdict.reasons
+    wrong, right = (int(text.partition("statistic ")[2].partition(")")[0]) for text in (x, y))
+    assert x.startswith("The data contradict prior 'tool_x = 15")
+    assert y.startswith("The data contradict prior 'tool_y = -3.7")
+    assert wrong > right
+    assert order == "Correct the one with the largest statistic first: the others may be right."
+    assert "weight" not in " ".join(before)
+
+
 def test_what_free_frames_explain_is_no_error_of_stated_ones() -> None:
     problem = ro.load("position").problem
     names = np.array(problem.parameters.names)

@@ -158,3 +158,13 @@ def test_deviations_beyond_a_tolerance_that_nothing_bounds_are_named() -> None:
     assert "d4" in line
     bounded = ro.calibrate(tight, ro.bounded, 1e-3)
     assert not [line for line in words.remarks(bounded, bounded.verdict) if line.startswith("Beyond")]
+
+
+def test_deviations_are_unusual_from_the_mean_of_the_prior() -> None:
+    problem = ro.load("position").problem
+    p = problem.parameters
+    other = replace(p, nominal=p.nominal - 0.1 * (np.array(p.names) == "theta3"))
+    prior = ro.bayes.Prior(centre={"theta3_mrad": 100.0}, scale={"theta3_mrad": 3.0})
+    result = ro.calibrate(problem.with_parameters(other), prior=prior)
+    assert result.x[result.problem.parameters.free.names.index("theta3")] == pytest.approx(0.1, abs=1e-3)
+    assert "prior standard deviations" not in " ".join(words.weight_lines(result))

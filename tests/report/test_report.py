@@ -198,11 +198,11 @@ def test_other_formulations_have_a_report(formulation) -> None:
     assert ("L-curve: residual norm" in text) == (formulation is not ro.least_squares)
 
 
-def test_matrices_of_a_stated_prior_are_named_by_their_size() -> None:
+def test_a_stated_prior_is_named_and_not_its_matrices() -> None:
     problem, _ = simulated(("a?", "theta?", "base_*"), noise=5e-5)
     stated = ro.bayes.Prior.known("a2 + a3 = nominal +- 0.01 mm").stated(problem.parameters)
     text = page(ro.calibrate(problem, stated.penalized(ro.tikhonov), 1.0))
-    assert f"prior_penalty(sum_squares, {len(problem.parameters.free)} rows, " in text
+    assert "penalty sum_squares, with the stated prior, constraints: none" in text
     assert "0.0, 0.0" not in text
 
 
@@ -338,13 +338,13 @@ def test_new_measurements_verify_a_result_and_are_held_against_its_limit() -> No
     assert lead in text
     errors = new["later.csv"].error
     assert re.search(rf"Maximum error, identified\s*{1e3 * errors.max():.3f} mm\s*of {len(later)} rows", text)
-    assert f"Held out: {len(later)} rows" in text[: text.index("Error [mm]")]
+    assert f"New measurements: {len(later)} rows" in text[: text.index("Error [mm]")]
     off = replace(later, blocks=tuple(replace(block, y=block.y + 5e-3) for block in later.blocks))
     new["off.csv"] = ro.use.validate(result, off)
     text = " ".join(Reader(page(required(result, 1e-3), new)).words.split())
     assert "Accepted" not in text[: text.index("Validation on new measurements")]
     assert "Acceptance test by off.csv" in text
-    assert "Held out: 40 rows" in text
+    assert "New measurements: 40 rows" in text
 
 
 def test_a_robot_is_delivered_where_nothing_is_demanded(arm_page) -> None:

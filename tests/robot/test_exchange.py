@@ -775,7 +775,7 @@ def test_a_table_is_written_as_a_person_would(tmp_path: Path) -> None:
     ("name", "content", "found"),
     [
         ("r.csv", "alpha_deg,a,convention\n1,2,modified\n", "unknown key|no unit"),
-        ("r.csv", "alpha_deg,alpha_rad,convention\n1,2,modified\n", "the same quantity twice"),
+        ("r.csv", "alpha_deg,alpha_rad,convention\n1,2,modified\n", "alpha twice, in two units"),
         ("r.csv", "alpha_deg,a_mm,d_mm,convention\nninety,1,2,modified\n", "joint 1.alpha_deg: found 'ninety'"),
         ("r.csv", "alpha_deg,a_mm,d_mm,convention\nnan,1,2,modified\n", "joint 1.alpha_deg"),
         ("r.csv", "a_mm,d_mm,type,convention\n1,1,screw,modified\n", "joint 1.type: found 'screw'"),
