@@ -29,10 +29,9 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage
 from rpim_opt.calibration.verdict import Verdict, refuse_misread
-from rpim_opt.calibration.words import VAGUE
+from rpim_opt.calibration.words import VAGUE, unseen
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut, Requirement
-from rpim_opt.problem.diagnosis import LEAST_TRAVEL
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import in_base, markers, within
 from rpim_opt.robot.parameters import of_session
@@ -245,7 +244,7 @@ class Acceptance:
     ``requirement`` has limit, confidence and region, ``workspace`` the expanded uncertainties at its configurations;
     ``repeatability`` would be the largest of them if all parameters were known [m]. ``held_out`` are the errors on
     held-out rows and the coverage of their intervals, a document [mm] with its ``sentence``. ``caution`` says how joint
-    values count, where their signs or zeros were estimated.
+    values count, where their signs or zeros were estimated, and what was not checked.
     """
 
     requirement: Requirement
@@ -350,7 +349,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     undecided = () if result.mapping is None else result.mapping.ambiguities
     lacking += [reason for reason in result.verdict.reasons if reason in undecided]
     against = [reason for reason in result.verdict.reasons if reason not in undecided]
-    caution = " ".join(filter(None, [result.verdict.caution, _standing(result)]))
+    caution = " ".join(filter(None, [result.verdict.caution, *unseen(result)]))
     try:
         mapped = workspace(result, requirement, region, drawn)
     except InputError as error:
@@ -406,16 +405,6 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
         f"repeatability would still contribute {1e3 * repeatability:.3f} mm. `rpim-opt design --augment` names the "
         "configurations that help most."
     )
-
-
-def _standing(result: Calibration) -> str:
-    """Return a sentence on joints of the robot that hardly moved; empty if all did."""
-    (measured,), (robot,) = result.ranges.values(), result.problem.arms.values()
-    least = np.array([LEAST_TRAVEL[robot.joint_types[i]] for i in robot.leading])
-    still = [robot.joint(i) for i in np.flatnonzero(np.ptp(measured, axis=0) < least)]
-    if not still:
-        return ""
-    return f"Joint{'s' * (len(still) > 1)} {joined(still)} did not move: the verdict holds only at the measured values."
 
 
 def _rows_apart(result: Calibration, data: Dataset | None) -> tuple[Dataset, HeldOut, list[str], str] | None:

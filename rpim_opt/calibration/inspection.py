@@ -20,7 +20,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.words import contact_remarks
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.design import Observability, observe
-from rpim_opt.problem.diagnosis import LEAST_TRAVEL, all_q
+from rpim_opt.problem.diagnosis import all_q, hardly_moved
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.frames import fitted_frames
@@ -226,9 +226,8 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
         low, high = robot.limits[i]
         if q[:, i].min() < low - 1e-9 or q[:, i].max() > high + 1e-9:
             yield f"joint {robot.joint(i)} exceeds its limits {low / si:.1f} to {high / si:.1f} {unit}."
-        if np.ptp(q[:, i]) < LEAST_TRAVEL[robot.joint_types[robot.leading[i]]]:
-            moves = f"joint {robot.joint(i)} moves only {np.ptp(q[:, i]) / si:.2f} {unit}"
-            yield f"{moves}: its parameters are poorly identifiable."
+    for moves in hardly_moved(robot, np.array([q.min(axis=0), q.max(axis=0)])):
+        yield f"{moves}: its parameters are poorly identifiable."
     for block in problem.data.blocks:
         if block.y.shape[1] < 3:
             continue

@@ -16,9 +16,11 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.calibration.verdict import REPEATABILITY, Verdict
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.diagnosis import hardly_moved
 from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
+from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR
 from rpim_opt.robot.extensions import EXPECTED
 from rpim_opt.robot.parameters import EXPANSION, is_joint_offset, of_session, own_name
 
@@ -36,6 +38,7 @@ DEFLECTIONS = {
 UNUSUAL = 10.0  # scales of its group beyond which a deviation is said to be unusual: 2 in 1000 are under Student's t_3
 MOST = 5  # unusual parameters and outliers that are named one by one
 VAGUE = 0.5  # standard deviation of the logarithm of a hyperparameter from which on only its upper bound is said
+REDUNDANT = 0.99  # correlation of two parameters from which on little more than a combination is known of them
 NEGLIGIBLE = 0.1  # share of the largest part of the repeatability below which another is not said
 TWO_SIDED, ONE_SIDED = 1.96, 1.645  # standard normal quantiles of intervals and of bounds with 95 % confidence
 MOST_POINTS = 20  # points of a table; of others one row says how many there are
@@ -98,7 +101,7 @@ def sentences(result: Outcome, verdict: Verdict) -> list[str]:
             break
     reasons = [text for text in verdict.reasons if text != result.message]
     above = [*turned_frames(result), errors, *filter(None, [verdict.caution]), *reasons]
-    return [*above, *weight_lines(result), noise_sentence(result), *remarks(result, verdict)]
+    return [*above, *weight_lines(result), noise_sentence(result), *unseen(result), *remarks(result, verdict)]
 
 
 def noise_sentence(result: Outcome) -> str:
@@ -166,6 +169,28 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
             "instrument's in [noise] of problem.toml and remove noise_assumed."
         )
     return [*lines, result.message]
+
+
+def unseen(result: Outcome) -> list[str]:
+    """Return sentences on joints that hardly moved, and on frames of which the data determine a combination alone."""
+    p, covariance, lines = result.problem.parameters, result.known_covariance, []
+    still = [text for name, arm in result.problem.arms.items() for text in hardly_moved(arm, result.ranges[name])]
+    if still and (p.identified & ~p.of_frames).any():
+        lines.append(
+            f"Too little motion: {joined(still)}. The result holds only near the values that were measured there; "
+            "before using others, measure configurations in which these joints move."
+        )
+    std = np.zeros(len(p.free)) if covariance is None else np.sqrt(np.diag(covariance))
+    unknown = np.flatnonzero(np.isin(p.free.groups, (BASE, "tool")) & (std > NOMINAL_ERROR))
+    if covariance is not None and len(unknown):
+        correlation = (covariance / np.outer(std, std))[np.ix_(unknown, unknown)] - np.eye(len(unknown))
+        names = [p.free.names[unknown[i]] for i in np.flatnonzero(np.abs(correlation).max(axis=0) > REDUNDANT)]
+        if names:
+            lines.append(
+                f"{joined(names)} are redundant: the data determine a combination; either value and its uncertainty "
+                f'rest on stated start and scale. State one: [prior] known = ["{names[-1]} = ... +- ..."].'
+            )
+    return lines
 
 
 def _outlying(result: Outcome, advised: bool) -> list[str]:

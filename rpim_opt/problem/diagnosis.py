@@ -107,6 +107,16 @@ def first(*explanations: Iterable[str]) -> list[str]:
 # What is said of a table
 
 
+def hardly_moved(robot: Robot, measured: Array) -> list[str]:
+    """Return which joints moved less than `LEAST_TRAVEL` in measured ranges (2, dof), and how far, as text."""
+    lines = []
+    for i, (travel, dimension) in enumerate(zip(np.ptp(measured, axis=0), robot.joint_dimensions, strict=True)):
+        if travel < LEAST_TRAVEL[robot.joint_types[robot.leading[i]]]:
+            unit, si = display(dimension)
+            lines.append(f"joint {robot.joint(i)} moves only {travel / si:.2f} {unit}")
+    return lines
+
+
 def all_q(data: Dataset) -> Array:
     """Return the joint values (N, dof) of all points of all rows."""
     return np.concatenate([block.q.reshape(-1, block.q.shape[2]) for block in data.blocks])

@@ -213,6 +213,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
     lacking = judged(result)
     accepted = None if record.requirement is None else accept(result)
     uncertainty = measured_workspace(result) if accepted is None else None  # an acceptance test states it, too
+    said = "" if accepted is None else accepted.caution
     doubt = inconclusive(result, uncertainty)
     verdict = "" if accepted else doubt or delivered(result)
     remarks = [
@@ -223,6 +224,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         *words.turned_frames(result),
         *session_notes(result),
         nominal_note(result),
+        *(text for text in words.unseen(result) if text not in said),
         *warnings(result),
         *([result.message] if result.converged else []),
     ]

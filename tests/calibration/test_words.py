@@ -105,6 +105,15 @@ def test_what_a_file_could_not_hold_is_said() -> None:
     assert "cannot store functions of a script" in words.remarks(stand_in, Verdict())[0]
 
 
+def test_frames_of_which_the_data_determine_a_combination_are_named() -> None:
+    """On a SCARA base and reflector rise together; a known length of the tool tells them apart."""
+    problem = ro.load("scara").problem
+    said = "base_z and tool_z are redundant"
+    assert said in "".join(words.unseen(ro.calibrate(problem)))
+    assert said not in "".join(words.unseen(ro.calibrate(problem, prior=ro.bayes.Prior.known("tool_z +- 0.1 mm"))))
+    assert words.unseen(RESULT) == []
+
+
 def test_errors_before_and_after_are_in_millimetres() -> None:
     before, after = 1e3 * RESULT.nominal_errors().mean(), 1e3 * RESULT.errors().mean()
     assert f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after." in str(RESULT)
