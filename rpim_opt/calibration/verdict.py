@@ -124,7 +124,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     limited. Where the formulation limits the fit, other reasons than held-out rows follow from that, and are not named.
     """
     mapping = result.mapping.caution if result.mapping else ""
-    caution = " ".join(filter(None, [mapping, result.contradiction, _like_a_frame(result)]))
+    caution = " ".join(filter(None, [mapping, result.contradiction, like_a_frame(result)]))
     limited = tuple(text for text in causes if LIMITED in text)
     if limited:
         return Verdict((*limited, *_worse(result)), caution)
@@ -141,7 +141,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     return Verdict(tuple(dict.fromkeys(reasons)), caution)
 
 
-def _like_a_frame(result: Outcome) -> str:
+def like_a_frame(result: Outcome) -> str:
     """Return a sentence if errors of stated frames look to the data like the largest deviation of the robot.
 
     A wrong length of a stated tool is a deviation of the last d, a wrong place beside the last axis one of its theta.

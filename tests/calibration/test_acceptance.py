@@ -484,3 +484,17 @@ def test_joints_that_stood_are_named(tmp_path: Path) -> None:
     moved = ro.calibrate(instance.problem, "tikhonov", 1.0)
     assert said not in str(ro.calibration.accept(moved, ro.data.Requirement(1e-3)))
     assert said not in str(moved)
+
+
+def test_a_deviation_that_may_be_an_error_of_the_stated_tool_is_not_accepted() -> None:
+    instance = ro.load("position")
+    p = instance.problem.parameters
+    tool_z = np.array(p.names) == "tool_z"
+    wrong = replace(p, nominal=p.nominal + 0.01 * tool_z, identified=p.identified & ~tool_z)
+    result = replace(ro.calibrate(instance.problem.with_parameters(wrong)), record=instance.record)
+    acceptance = ro.calibration.accept(result, ro.data.Requirement(5e-4))
+    assert acceptance.verdict == "inconclusive"
+    (reason,) = acceptance.reasons
+    assert reason.startswith("Missing: a check of the stated frame")
+    moved = ro.use.compensate(result, instance.validation.q, tool=[0.1, 0, 0.2, 0, 0, 0])
+    assert "an error of the stated tool_z: check it." in str(moved)
