@@ -181,7 +181,8 @@ def unseen(result: Outcome) -> list[str]:
             "before using others, measure configurations in which these joints move."
         )
     std = np.zeros(len(p.free)) if covariance is None else np.sqrt(np.diag(covariance))
-    unknown = np.flatnonzero(np.isin(p.free.groups, (BASE, "tool")) & (std > NOMINAL_ERROR))
+    placed = [own_name(name).startswith((f"{BASE}_", "tool_")) for name in p.free.names]
+    unknown = np.flatnonzero(placed & (std > NOMINAL_ERROR))
     if covariance is not None and len(unknown):
         correlation = (covariance / np.outer(std, std))[np.ix_(unknown, unknown)] - np.eye(len(unknown))
         names = [p.free.names[unknown[i]] for i in np.flatnonzero(np.abs(correlation).max(axis=0) > REDUNDANT)]
