@@ -173,24 +173,27 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
 
 def unseen(result: Outcome) -> list[str]:
     """Return sentences on joints that hardly moved, and on frames of which the data determine a combination alone."""
-    p, covariance, lines = result.problem.parameters, result.known_covariance, []
+    p = result.problem.parameters
+    lines = []
     still = [text for name, arm in result.problem.arms.items() for text in hardly_moved(arm, result.ranges[name])]
     if still and (p.identified & ~p.of_frames).any():
         lines.append(
             f"Too little motion: {joined(still)}. The result holds only near the values that were measured there; "
             "before using others, measure configurations in which these joints move."
         )
-    std = np.zeros(len(p.free)) if covariance is None else np.sqrt(np.diag(covariance))
+    covariance = result.known_covariance
+    if covariance is None:
+        return lines
+    std = np.sqrt(np.diag(covariance))
     placed = [own_name(name).startswith((f"{BASE}_", "tool_")) for name in p.free.names]
-    unknown = np.flatnonzero(placed & (std > NOMINAL_ERROR))
-    if covariance is not None and len(unknown):
-        correlation = (covariance / np.outer(std, std))[np.ix_(unknown, unknown)] - np.eye(len(unknown))
-        names = [p.free.names[unknown[i]] for i in np.flatnonzero(np.abs(correlation).max(axis=0) > REDUNDANT)]
-        if names:
-            lines.append(
-                f"{joined(names)} are redundant: the data determine a combination; either value and its uncertainty "
-                f'rest on stated start and scale. State one: [prior] known = ["{names[-1]} = ... +- ..."].'
-            )
+    vague = np.flatnonzero(placed & np.isfinite(std) & (std > NOMINAL_ERROR))
+    correlation = covariance[np.ix_(vague, vague)] / np.outer(std[vague], std[vague]) - np.eye(len(vague))
+    names = [p.free.names[k] for k, each in zip(vague, correlation, strict=True) if np.abs(each).max() > REDUNDANT]
+    if names:
+        lines.append(
+            f"{joined(names)} are redundant: the data determine a combination; either value and its uncertainty rest "
+            f'on stated start and scale. State one: [prior] known = ["{names[-1]} = ... +- ..."].'
+        )
     return lines
 
 
