@@ -96,8 +96,7 @@ class RowError(InputError):
 class Conflict(NamedTuple):
     """Contradictory constraints: how far to loosen bounds of parameters and ``stated`` constraints [SI].
 
-    ``constraints`` are those that cannot hold together, of which none can be left out; ``loosen`` are the same sizes as
-    texts, those of parameters and of statements.
+    ``constraints`` cannot hold together, and none can be left out; ``loosen`` are the sizes as texts, of either kind.
     """
 
     parameters: dict[str, float]
@@ -110,7 +109,7 @@ class Conflict(NamedTuple):
         parts = []
         if self.constraints:
             parts.append(f"these constraints contradict each other: {', '.join(self.constraints)}")
-        return "; ".join([*parts, *(f"loosen {each}" for each in self.loosen)])
+        return "; ".join([*parts, *(f"loosen {each}" for each in self.loosen if each)])
 
 
 class NoSolutionFound(RpimError):

@@ -332,8 +332,8 @@ def camera_remarks(result: Outcome) -> list[str]:
             )
     if not any("stretch" in name for name in result.problem.parameters.free.names):
         remarks.append(
-            "Views do not identify the size of the board: an error in it scales the robot by the same factor "
-            "(for a printed board identify board_stretch_x and board_stretch_y)."
+            "Views do not identify the size of the board: an error in it scales the robot by the same factor. Measure "
+            "the board over all its squares, or identify board_stretch_x and board_stretch_y."
         )
     return remarks
 

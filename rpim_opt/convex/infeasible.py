@@ -46,18 +46,16 @@ def conflict(structure: Structure) -> Conflict | None:
         minimized(cp.Problem(cp.Minimize(cp.sum(slack)), _demands(_conditions(structure, z, **{kind: slack}))))
         slacks.append(np.zeros(count) if slack.value is None else np.asarray(slack.value)[:count])
     by_box, by_statement = slacks
-    bounds = {parameters.names[i]: float(by_box[i] * parameters.scale[i]) for i in np.flatnonzero(by_box > LEAST)}
-    dimension = dict(zip(parameters.names, parameters.dimensions, strict=True))
-    texts = [", ".join(f"{name} by {as_text(by, dimension[name])}" for name, by in bounds.items())]
-    statements: dict[str, float] = {}
-    by_unit = []
-    for each, by in zip(parsed, by_statement, strict=True):
-        if by > LEAST:
-            statements[each.name] = float(each.scale(parameters) * by)
-            unit, si = each.unit
-            by_unit.append(f"{each.name} by {statements[each.name] / si:.4g} {unit}")
-    texts.append(", ".join(by_unit))
-    return Conflict(bounds, tuple(condition.name for condition in left), statements, tuple(filter(None, texts)))
+    boxes = {i: float(by_box[i] * parameters.scale[i]) for i in np.flatnonzero(by_box > LEAST)}
+    pairs = zip(parsed, by_statement, strict=True)
+    stated = {each.name: (float(each.scale(parameters) * by), each.unit) for each, by in pairs if by > LEAST}
+    loosen = (
+        ", ".join(f"{parameters.names[i]} by {as_text(by, parameters.dimensions[i])}" for i, by in boxes.items()),
+        ", ".join(f"{name} by {by / si:.4g} {unit}" for name, (by, (unit, si)) in stated.items()),
+    )
+    bounds = {parameters.names[i]: by for i, by in boxes.items()}
+    statements = {name: by for name, (by, _) in stated.items()}
+    return Conflict(bounds, tuple(condition.name for condition in left), statements, loosen)
 
 
 def _demands(conditions: list[Condition]) -> list[Any]:

@@ -324,11 +324,10 @@ def overlay(
         members[JOINT_OFFSET] = offsets
     for key in filter(re.compile(r"[*?\[]").search, table):
         stem, _ = split_unit(key)
-        some = [i for i, name in enumerate(parameters.names) if fits(name, stem)]
-        if not some:
-            found = f"'{stem}', which fits no parameter"
-            raise InputError(f"{where}, key {key}", found, choices(stem, parameters.names)).within(file)
-        members[stem] = some
+        members[stem] = [i for i, name in enumerate(parameters.names) if fits(name, stem)]
+        if not members[stem]:
+            accepted = choices(stem, parameters.names)
+            raise InputError(f"{where}, key {key}", "a pattern that fits no parameter", accepted, file)
     members |= {name: [i] for i, name in enumerate(parameters.names)}
     order = list(members)
     dimensions = np.array(parameters.dimensions)

@@ -155,7 +155,7 @@ def test_a_folder_learns_from_a_population(folder: Path) -> None:
         ("[prior.scale]\ntheta5 = 1.0", "table scale, key theta5"),
         (
             '[prior.scale]\n"thta?_mrad" = 1.0',
-            "key thta?_mrad: found 'thta?', which fits no parameter, accepted: theta1,",
+            "key thta?_mrad: found a pattern that fits no parameter, accepted: theta1,",
         ),
         ("[prior.centre]\ntheta55_mrad = 1.0", "unknown key 'theta55_mrad'"),
         ('groups = ["b?"]', "key groups"),

@@ -313,7 +313,7 @@ def _by_time(joints: CanonicalTable, values: CanonicalTable, key: str, within: f
         count = np.count_nonzero(moved > MOVED)
         notes.append(
             f"the robot moved by up to {moved.max():.2g} degrees between measurement and joint values in {count} of "
-            f"{len(right)} joined rows. {_clocks(joints, there, then[right])}"
+            f"{len(right)} joined rows: do the clocks differ? {_clocks(joints, there, then[right])}"
         )
     lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right.tolist()))]
     if lonely:
@@ -326,17 +326,17 @@ def _by_time(joints: CanonicalTable, values: CanonicalTable, key: str, within: f
 
 
 def _clocks(joints: CanonicalTable, times: Array, moments: Array) -> str:
-    """Say what to add to moments (K,) [s] of measurements so that the robot stands still then, if anything does."""
+    """Say what to add to moments (K,) [s] of measurements for the robot to stand still at the most of them."""
     when = moments + OFFSETS[:, None]
     still = (when > times.min()) & (when < times.max()) & (_motion(joints, times, when - STILL, when + STILL) < MOVED)
     good = np.flatnonzero(still.mean(axis=1) > RESTING)
     if not len(good) or len(moments) < FEWEST:
-        return "Do the clocks differ (add the offset to the times of one file), or was it measured as it moved?"
+        return "If so, add the offset to the times of one file."
     runs = np.split(good, np.flatnonzero(np.diff(good) > 1) + 1)
     nearest = OFFSETS[min(runs, key=lambda run: np.abs(OFFSETS[run]).min())]
     return (
         f"It stands still if {nearest.mean():+.2g} s ({nearest[0]:+.2f} to {nearest[-1]:+.2f}) are added to the times "
-        "of the measured rows: the clocks differ. Add their offset to the column of times, and join again."
+        "of the measured rows: add the clocks' offset to that column."
     )
 
 
