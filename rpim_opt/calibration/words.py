@@ -101,7 +101,7 @@ def sentences(result: Outcome, verdict: Verdict) -> list[str]:
             break
     reasons = [text for text in verdict.reasons if text != result.message]
     above = [*turned_frames(result), errors, *filter(None, [verdict.caution]), *reasons]
-    return [*above, *weight_lines(result), noise_sentence(result), *unseen(result), *remarks(result, verdict)]
+    return [*above, *weight_lines(result), noise_sentence(result), *underdetermined(result), *remarks(result, verdict)]
 
 
 def noise_sentence(result: Outcome) -> str:
@@ -171,7 +171,7 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
     return [*lines, result.message]
 
 
-def unseen(result: Outcome) -> list[str]:
+def underdetermined(result: Outcome) -> list[str]:
     """Return sentences on joints that hardly moved, and on frames of which the data determine a combination alone."""
     p = result.problem.parameters
     lines = []

@@ -321,7 +321,7 @@ def _parameters(content: Content) -> Iterator[Block]:
 def _diagnostics(content: Content) -> Iterator[Block]:
     result = content.result
     yield "heading", "Residuals"
-    yield "text", [words.noise_sentence(result), *words.unseen(result), *content.composition]
+    yield "text", [words.noise_sentence(result), *words.underdetermined(result), *content.composition]
     signed = []
     what = ""
     if len(summary.sets(result)) > 1:

@@ -224,7 +224,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         *words.turned_frames(result),
         *session_notes(result),
         nominal_note(result),
-        *(text for text in words.unseen(result) if text not in said),
+        *(text for text in words.underdetermined(result) if text not in said),
         *warnings(result),
         *([result.message] if result.converged else []),
     ]

@@ -27,7 +27,7 @@ from rpim_opt.calibration.acceptance import accept, inconclusive, measured_works
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import transmission_errors
-from rpim_opt.calibration.words import unseen
+from rpim_opt.calibration.words import underdetermined
 from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
@@ -202,7 +202,7 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
         doubt = accepted.summary if accepted.verdict == "inconclusive" else ""
         remarks += [accepted.summary] if accepted.verdict == "accepted" else []
     undecided = bool(doubt) and verdict.delivered
-    doubts = doubt if verdict.delivered else "", *unseen(alone)
+    doubts = doubt if verdict.delivered else "", *underdetermined(alone)
     note = " ".join(filter(None, [verdict.require(despite_verdict), *doubts]))
     if alone is whole or found is None:
         return note, [], remarks, undecided

@@ -109,9 +109,11 @@ def test_frames_of_which_the_data_determine_a_combination_are_named() -> None:
     """On a SCARA base and reflector rise together; a known length of the tool tells them apart."""
     problem = ro.load("scara").problem
     said = "base_z and tool_z are redundant"
-    assert said in "".join(words.unseen(ro.calibrate(problem)))
-    assert said not in "".join(words.unseen(ro.calibrate(problem, prior=ro.bayes.Prior.known("tool_z +- 0.1 mm"))))
-    assert words.unseen(RESULT) == words.unseen(ro.calibrate(ro.load("plane").problem)) == []
+    assert said in "".join(words.underdetermined(ro.calibrate(problem)))
+    assert said not in "".join(
+        words.underdetermined(ro.calibrate(problem, prior=ro.bayes.Prior.known("tool_z +- 0.1 mm")))
+    )
+    assert words.underdetermined(RESULT) == words.underdetermined(ro.calibrate(ro.load("plane").problem)) == []
 
 
 def test_errors_before_and_after_are_in_millimetres() -> None:
