@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from html import unescape
 from importlib import import_module
-from itertools import islice
+from itertools import islice, repeat
 from pathlib import Path
 from string import ascii_letters
 from typing import Any, BinaryIO, NamedTuple
@@ -403,12 +403,19 @@ def _sheets(stream: BinaryIO) -> dict[str, Iterable[Iterable[Any]]]:
             raise InputError("the file", f"{size} bytes unpacked", f"{LARGEST_WORKBOOK}, or more as .csv or .parquet")
         if "content.xml" in archive.namelist():  # OpenDocument
             named = re.split(r"<table:table\s[^<>]*table:name=\"([^\"]*)", archive.read("content.xml").decode())[1:]
-            rows = [map(_cells_of_page, re.split(r"<table:table-row\b", sheet)[1:]) for sheet in named[1::2]]
-            return dict(zip(map(unescape, named[::2]), rows, strict=True))
+            return dict(zip(map(unescape, named[::2]), map(_rows_of_sheet, named[1::2]), strict=True))
     book = library("openpyxl", "Excel files").load_workbook(stream, read_only=True, data_only=True)
     for sheet in book.worksheets:
         sheet.reset_dimensions()  # what the file says of them would fill every row up
     return {sheet.title: sheet.iter_rows(values_only=True) for sheet in book.worksheets}
+
+
+def _rows_of_sheet(sheet: str) -> Iterator[list[str]]:
+    """Yield the rows of an OpenDocument sheet; what it states once for equal rows as often as they are there."""
+    for row in re.split(r"<table:table-row\b", sheet)[1:]:
+        cells = list(_cells_of_page(row))
+        times = re.match(r'[^<>]*number-rows-repeated="(\d{1,7})"', row)
+        yield from repeat(cells, int(times[1]) if times and any(cells) else 1)
 
 
 def _filled(rows: Iterable[Iterable[Any]]) -> Iterator[tuple[int, list[str]]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 import openpyxl
@@ -366,3 +367,17 @@ def test_messages_that_ros_prints_into_a_text_are_read_and_xml_is_named(tmp_path
     assert found.columns["q2_rad"] == ["0.5", "1.5"]
     with pytest.raises(ro.InputError, match=r"the file's name: found 'm.xml'"):
         read(write(tmp_path, "<?xml version='1.0'?><a/>", "m.xml"))
+
+
+def test_equal_rows_of_a_spreadsheet_are_as_many_as_they_were(tmp_path: Path) -> None:
+    """OpenDocument states equal rows once, with their number; empty ones to the end of the sheet too."""
+
+    def row(repeated: int, *cells: str) -> str:
+        inside = "".join(f"<table:table-cell><text:p>{cell}</text:p></table:table-cell>" for cell in cells)
+        return f'<table:table-row table:number-rows-repeated="{repeated}">{inside}</table:table-row>'
+
+    head = ["q1_deg", "q2_deg", "x_mm", "y_mm", "z_mm"]
+    rows = row(1, *head) + row(3, "10", "20", "1", "2", "3") + row(1, "11", "20", "1", "2", "4") + row(1048571, "")
+    with ZipFile(tmp_path / "raw.ods", "w") as archive:
+        archive.writestr("content.xml", f'<office:body><table:table table:name="A">{rows}</table:table></office:body>')
+    assert [row[0] for row in read_grid(tmp_path / "raw.ods").rows] == ["q1_deg", "10", "10", "10", "11"]
