@@ -261,7 +261,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     # about the middle: where all y are negative, their signs lost are a mirrored frame, and that is what is named
     "signs of positions lost": (
         values(lambda y: np.abs(y - y.mean(axis=0))),
-        "no value of column x, y and z is negative",
+        "no value of columns x, y and z is negative",
     ),
     "y a copy of x": (values(lambda y: y[:, [0, 0, 2]]), "columns x and y are equal in every row"),
     "z a column of RMS": (
@@ -332,7 +332,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
         values(lambda y: np.column_stack([y[:, :2], np.random.default_rng(3).permutation(y[:, 2])])),
         "the values of coordinate z explain nothing",
     ),
-    "deviations": (deviations, "deviations, or another quantity"),
+    "deviations": (deviations, "were deviations exported, not positions"),
     "the floor heaves": (
         values(lambda y: y + 1e-3 * np.outer(np.sin(np.arange(COUNT) / 3.5), [0, 0, 1])),
         "the instrument or the base drifted slowly",
