@@ -41,7 +41,7 @@ SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": 
 """What may stand between cells, by name; a space stands for any number of them."""
 SAMPLE = 2**15  # characters from which the separator is found
 HTML = (".html", ".htm")
-TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts", ".md", *HTML)
+TEXTS = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", ".xyz", ".pts", ".md", *HTML)
 EXCEL = (".xlsx", ".xlsm", ".ods")
 NUMBERS_OF_ROW = 3  # numbers in a row from which on a sheet is one of measurements
 NUMERAL = re.compile(r"(?!\d+([.,])(?:\d\d?|\d{4,})\1)[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")  # no 31.05.2026

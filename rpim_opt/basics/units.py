@@ -210,9 +210,10 @@ def split(name: str) -> tuple[str, str]:
     """Split a column name into the name without its unit and the unit, which may be empty.
 
     >>> from rpim_opt.basics.units import split
-    >>> [split(name) for name in ("x_mm", "U(95) X [mm]", "J1 (°)", "z / µm", "y in inch", "position[0]")]
-    [('x', 'mm'), ('U(95) X', 'mm'), ('J1', 'deg'), ('z', 'um'), ('y', 'in'), ('position[0]', '')]
+    >>> [split(name) for name in ("x_mm", "U(95) X [mm]", "J1 (°)", "z / µm", "y in inch", "T [C]", "position[0]")]
+    [('x', 'mm'), ('U(95) X', 'mm'), ('J1', 'deg'), ('z', 'um'), ('y', 'in'), ('T', 'degC'), ('position[0]', '')]
     """
+    name = name.replace("[C]", "[degC]")
     stem, unit = split_unit(name)
     if unit:
         return stem, "degC" if name == CELSIUS else name[len(stem) + 1 :]

@@ -14,7 +14,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.tables import read_grid
-from rpim_opt.basics.units import parse_units
+from rpim_opt.basics.units import parse_units, split
 from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import together
@@ -381,3 +381,12 @@ def test_equal_rows_of_a_spreadsheet_are_as_many_as_they_were(tmp_path: Path) ->
     with ZipFile(tmp_path / "raw.ods", "w") as archive:
         archive.writestr("content.xml", f'<office:body><table:table table:name="A">{rows}</table:table></office:body>')
     assert [row[0] for row in read_grid(tmp_path / "raw.ods").rows] == ["q1_deg", "10", "10", "10", "11"]
+
+
+def test_a_log_may_be_a_table_with_temperatures_in_degrees_celsius(tmp_path: Path) -> None:
+    """A file .log is tried as ROS messages first; ``[C]`` is degC, as no other unit is called so."""
+    path = tmp_path / "controller.log"
+    path.write_text("# cell 4\nLabel,A1 (deg),A2 (deg),X [mm],Temperature [C]\nP1,10,-20,5,21.5\nP2,11,-21,6,22.5\n")
+    table = read_raw(path, None)
+    assert list(table.columns["A1 (deg)"]) == ["10", "11"]
+    assert split("Temperature [C]") == ("Temperature", "degC")
