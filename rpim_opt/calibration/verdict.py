@@ -47,6 +47,9 @@ MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), 
 UNUSUAL = {"length": 0.004, "angle": 0.05}
 """Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
 ALIKE = 0.045  # part of an effect on the data that others may leave where these do not distinguish them
+DEPENDENT = 1e-6  # singular value of effects, over the largest, below which they are combinations of the others
+TAKES_PART = 0.1  # part of the largest share in an effect from which on a frame parameter is named
+WIDE = 1e4  # prior standard deviations of what has no penalty
 EXCLUDED = 0.25  # share of the rows that may be outliers
 COMPUTED, COMPUTED_RMS = 0.05, 2e-5  # nominal RMS over the stated noise, and itself [m], of computed positions
 ROUNDED = 1.1  # nominal RMS over what rounding of the measured values makes, below which they were computed, too
@@ -177,18 +180,18 @@ def _taking_part(result: Outcome, k: int) -> list[str]:
     stated = ~mine | np.isin(every.names, result.actively_constrained)
     form = result.program.penalty_form
     if form is not None:  # within its prior, what is stated has less effect than the parameter that took its error up
-        prior = np.vstack([result.penalty_weight**0.5 * form.matrix, 1e-4 * np.eye(len(result.x))])
+        prior = np.vstack([result.penalty_weight**0.5 * form.matrix, np.eye(len(result.x)) / WIDE])
         width = np.linalg.norm(np.linalg.pinv(prior), axis=1)
         stated[mine] |= width * sizes[mine] < min(width[k], np.abs(result.z[k])) * sizes[mine][k]
     free, held = effects[:, every.of_frames & ~stated], every.placed & stated
     left = np.column_stack([effects[:, mine][:, k], effects[:, held]])
-    left -= free @ np.linalg.pinv(free, rcond=1e-6) @ left
+    left -= free @ np.linalg.pinv(free, rcond=DEPENDENT) @ left
     own = left[:, 0]
-    parts = left[:, 1:] * np.linalg.lstsq(left[:, 1:], own, rcond=1e-6)[0]
+    parts = left[:, 1:] * np.linalg.lstsq(left[:, 1:], own, rcond=DEPENDENT)[0]
     if np.linalg.norm(own) < ALIKE or np.linalg.norm(own - parts.sum(axis=1)) > ALIKE * np.linalg.norm(own):
         return []
     part = np.linalg.norm(parts, axis=0)
-    return np.array(every.names)[held][part > 0.1 * part.max()].tolist()
+    return np.array(every.names)[held][part > TAKES_PART * part.max()].tolist()
 
 
 def kept_rows(result: Outcome) -> np.ndarray:
