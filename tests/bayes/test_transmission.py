@@ -273,3 +273,27 @@ def test_curves_stand_beside_any_noise(noise):
     problem, _ = measured(SIZE, configurations=80)
     result = ro.calibrate(problem, noise=noise, model="auto")
     assert "transmission error" in result.learned.extensions
+
+
+@pytest.mark.parametrize("seed", [29, 39])
+def test_backlash_is_no_curve_that_turns_between_two_measured_angles(seed: int) -> None:
+    """A length below the spacing of the angles is noise of the joints: as a curve it hid 1 mm of new rows."""
+    rng = np.random.default_rng(seed)
+    alpha, theta = np.radians([0, -90, 0, -90, 90, 0]), np.radians([0, -90, 0, 0, 0, 180])
+    a, d = [0, 0.35, 1.15, -0.04, 0, 0], [0.78, 0, 0, 1.2, 0, 0.215]
+    high = np.radians([150, 65, 60, 170, 110, 170])
+    robot = ro.robot.Robot("palletizer", np.column_stack([alpha, a, theta, d, np.zeros(6)]), ("revolute",) * 6)
+    identify = ["alpha?", "a?", "theta?", "d?", "base_*", "tool_[xyz]"]
+    parameters = ro.robot.model_parameters(robot, (5, 1, 0.2, 0.1, 0, 1), {"": [0.06, -0.03, 0.09, 0, 0, 0]})
+    parameters = parameters.identify(identify).scaled({"base_mm": 10, "base_mrad": 10, "tool_mm": 10})
+    q = rng.uniform(-high, high, (50, 6)) + np.radians([0, 5, 0, 0, 0, 0])
+    problem = ro.CalibrationProblem(robot, parameters, ro.Dataset.of(q, np.zeros((50, 3)), 5e-5))
+    x = 0.5 * rng.normal(size=len(parameters.free)) * parameters.free.scale
+    sides = np.outer(5e-4 * rng.choice([-1, 1], 50), [1, 0, 0, 0, 0, 0])
+    y = problem.on(ro.Dataset.of(q + sides, np.zeros((50, 3)), 5e-5)).modelled(x)[0]
+    y += 5e-5 * rng.normal(size=y.shape)
+    result = ro.calibrate(problem.on(ro.Dataset.of(q, y, 5e-5)), model="auto")
+    assert result.learned is not None
+    assert result.learned.curves is None
+    assert not result.verdict.delivered
+    assert "backlash, joint 1 by 1 mrad" in str(result.verdict)
