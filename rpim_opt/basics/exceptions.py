@@ -96,7 +96,7 @@ class RowError(InputError):
 class Conflict(NamedTuple):
     """Contradictory constraints: how far to loosen bounds of parameters and ``stated`` constraints [SI].
 
-    ``constraints`` cannot hold together, and none can be left out; ``loosen`` are the sizes as texts, of either kind.
+    ``constraints`` cannot hold together, and none can be left out; ``loosen`` says by how much, of either kind.
     """
 
     parameters: dict[str, float]

@@ -470,8 +470,7 @@ def _parts(stem: str, count: int) -> Sequence[str]:
 
 def _one_row_each(table: RawTable) -> RawTable:
     """Return a table whose rows hold a coordinate, ``P1, X, 1.5``, or a joint and one per point; others as is."""
-    named = {name: sorted({str(cell).strip().lower() for cell in cells}) for name, cells in table.columns.items()}
-    axis, parts = next((each for each in named.items() if PARTS.fullmatch(" ".join(each[1]))), ("", []))
+    axis, parts = _axis(table.columns)
     if not axis:
         return table
     texts = {name: [str(cell).strip() for cell in cells] for name, cells in table.columns.items()}
@@ -492,6 +491,15 @@ def _one_row_each(table: RawTable) -> RawTable:
         columns[_with_unit(part, unit)] = [texts[value][rows[part]] if part in rows else "" for rows in points]
     note = f"one row per coordinate: column '{value}' by '{axis}'."
     return replace(table, columns=columns, notes=(*table.notes, note))
+
+
+def _axis(columns: Mapping[str, Sequence[Any]]) -> tuple[str, list[str]]:
+    """Return the column whose cells name x, y, z or the joints and nothing else, and these names; or none."""
+    for name, cells in columns.items():
+        parts = sorted({str(cell).strip().lower() for cell in cells})
+        if PARTS.fullmatch(" ".join(parts)):
+            return name, parts
+    return "", []
 
 
 def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:

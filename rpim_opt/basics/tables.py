@@ -237,7 +237,8 @@ def _cells_of_page(row: str) -> Iterator[str]:
         cell = value[1] if value else " ".join(unescape(re.sub(r"<[^>]*>", " ", inside)).split())
         yield cell
         span = re.search(r"(colspan|columns-repeated)\W+(\d{1,2})\b", stated, re.IGNORECASE)
-        yield from [cell if span[1] == "columns-repeated" else ""] * (int(span[2]) - 1) if span else ()
+        if span:
+            yield from repeat(cell if span[1] == "columns-repeated" else "", int(span[2]) - 1)
 
 
 def _decimal(angle: re.Match[str]) -> str:
@@ -296,8 +297,9 @@ def _separator(text: str) -> str:
     best = max(parted, key=parted.__getitem__)
     if blanks > BLANKS_CLEARLY * parted[best]:
         return " "
-    # a header may be so wide that no row is seen
-    return best if parted[best] else max(parted, key=lambda mark: sum(map(len, rows[mark])))
+    if not parted[best]:  # a header so wide that no row is seen
+        best = max(parted, key=lambda mark: sum(map(len, rows[mark])))
+    return best
 
 
 def _parted(row: Sequence[str]) -> int:

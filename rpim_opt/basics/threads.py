@@ -18,7 +18,9 @@ WORKER = "rpim_opt"  # what the names of threads begin with
 
 def cores() -> int:
     """Return the number of processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> list[Answer]:

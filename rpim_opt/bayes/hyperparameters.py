@@ -113,8 +113,8 @@ class Learned(Brief):
     curves: Transmitted | None = None
 
     def _short(self) -> str:
-        sizes = ", ".join(f"{name} {size.value:.3g}" for name, size in self.scales.items())
-        return f"hyperparameters: {sizes}; {len(self.left_out)} rows excluded"
+        scales = ", ".join(f"{name} {scale.value:.3g}" for name, scale in self.scales.items())
+        return f"hyperparameters: {scales}; {len(self.left_out)} rows excluded"
 
     @property
     def extensions(self) -> tuple[str, ...]:
@@ -322,9 +322,9 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         growth[i] += 2 * (variance(repeatability) - variance(replace(repeatability, **{kind: 0.0})))
     growth = growth / (float(np.sum((X @ point.C) * X)) + variance(repeatability))
     values = [Hyperparameter(float(v), float(s)) for v, s in zip(np.exp(point.logs), spread, strict=True)]
-    sizes, noise = len(prior.names), len(prior.hyperparameters)
-    plain = np.delete(np.arange(len(values)), slice(sizes, noise))  # without the curves'
-    size = np.append(np.exp(point.logs[:sizes]), np.nan)[prior.group]
+    groups, noise = len(prior.names), len(prior.hyperparameters)
+    plain = np.delete(np.arange(len(values)), slice(groups, noise))  # without the curves'
+    size = np.append(np.exp(point.logs[:groups]), np.nan)[prior.group]
     local = np.sqrt(point.v) / size
     heavy = np.flatnonzero(prior.heavy & ~prior.replaced)
     scales = np.sqrt(prior.variances(point.logs)[0][heavy])
@@ -345,7 +345,7 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         factors = evidence.overdispersion(point, fit.problem.joint_values[fit.problem.owners])
         drift.append(widening(point.C, factors.max()))
     return Learned(
-        scales=dict(zip(prior.names, values[:sizes], strict=True)),
+        scales=dict(zip(prior.names, values[:groups], strict=True)),
         noise=dict(zip(evidence.noise, values[noise:], strict=True)),
         local=np.where(np.isfinite(size), local, 1.0),
         value=point.value,
@@ -354,6 +354,6 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         stated=fit.problem.parameters.free.scale,
         drift=fit.unit[:, None] * np.column_stack(drift),
         notes=tuple(notes),
-        curves=None if prior.spectrum is None else Transmitted(*values[sizes:noise], gain=gain),
+        curves=None if prior.spectrum is None else Transmitted(*values[groups:noise], gain=gain),
         **more,
     )

@@ -175,14 +175,14 @@ def _taking_part(result: Outcome, k: int) -> list[str]:
     x = np.zeros(len(mine))
     x[mine] = result.x
     effects = framed.linearize(x).A
-    sizes = np.maximum(np.linalg.norm(effects, axis=0), TINY)
-    effects /= sizes
+    norms = np.maximum(np.linalg.norm(effects, axis=0), TINY)
+    effects /= norms
     stated = ~mine | np.isin(every.names, result.actively_constrained)
     form = result.program.penalty_form
     if form is not None:  # within its prior, what is stated has less effect than the parameter that took its error up
         prior = np.vstack([result.penalty_weight**0.5 * form.matrix, np.eye(len(result.x)) / WIDE])
         width = np.linalg.norm(np.linalg.pinv(prior), axis=1)
-        stated[mine] |= width * sizes[mine] < min(width[k], np.abs(result.z[k])) * sizes[mine][k]
+        stated[mine] |= width * norms[mine] < min(width[k], np.abs(result.z[k])) * norms[mine][k]
     free, held = effects[:, every.of_frames & ~stated], every.placed & stated
     left = np.column_stack([effects[:, mine][:, k], effects[:, held]])
     left -= free @ np.linalg.pinv(free, rcond=DEPENDENT) @ left

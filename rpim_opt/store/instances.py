@@ -132,10 +132,8 @@ def load(
             problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
         formulation = _formulation(definition, problem)
         prior = problem_file.stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
-        nominal = [name for each in prior.statements if each.reference is None for name in each.names]
-        if definition.base is None and (registered := [name for name in nominal if name.startswith("base_")]):
-            found = f"'{registered[0]}' without a value, where base = \"auto\""
-            raise InputError("key prior.known", found, f"'{registered[0]} = ... +- ...', or a table [base]")
+        if definition.base is None:
+            _require_values_of_base(prior)
         details = problem_file.stated_details(table.record)
         with problem_file.at_key("reading", path, part=True):
             TableOptions.stated(table.reading)
@@ -174,6 +172,15 @@ def load(
         reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
         held_out=table.held_out,
     )
+
+
+def _require_values_of_base(prior: Prior) -> None:
+    """Refuse known parameters of a base without a value, where the problem states no base."""
+    nominal = [name for each in prior.statements if each.reference is None for name in each.names]
+    for name in nominal:
+        if name.startswith("base_"):
+            found = f"'{name}' without a value, where base = \"auto\""
+            raise InputError("key prior.known", found, f"'{name} = ... +- ...', or a table [base]")
 
 
 def _of_chains(stated: problem_file.ProblemFile, parts: Mapping[str, Instance]) -> Instance:

@@ -202,8 +202,9 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
         doubt = accepted.summary if accepted.verdict == "inconclusive" else ""
         remarks += [accepted.summary] if accepted.verdict == "accepted" else []
     undecided = bool(doubt) and verdict.delivered
-    doubts = doubt if verdict.delivered else "", *underdetermined(alone)
-    note = " ".join(filter(None, [verdict.require(despite_verdict), *doubts]))
+    note = " ".join(
+        filter(None, [verdict.require(despite_verdict), doubt if undecided else "", *underdetermined(alone)])
+    )
     if alone is whole or found is None:
         return note, [], remarks, undecided
     stays = np.linalg.norm(alone.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
