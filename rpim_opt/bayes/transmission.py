@@ -32,7 +32,6 @@ SHORTEST = 0.05  # travel of a joint [rad] from which its curve is looked for
 BEYOND = 0.3  # how far curves go on beyond the measured angles [rad], where they are unknown
 STARTS = (0.3, 0.03)  # length scales [rad] from which the optimum is looked for
 ACCURACY = 0.3  # slope of -2 ln L by the logarithms of hyperparameters at which curves are admitted
-CONNECTED = 0.7  # correlation length, over the mean spacing of angles, below which curves are noise of the joints
 LEAST = 2e-6  # noise [m or rad] from which its optimum is looked for at least
 
 
@@ -54,8 +53,7 @@ def admitted(
 ) -> tuple[Fit, tuple[Trial, ...], float] | None:
     """Return the fit with transmission errors, the models compared, and the decrease of -2 ln L; None if too small.
 
-    And where curves hardly correlate one measured angle with the next, as joints' repeatability does not, and where an
-    equation depends on several configurations, or on one of several robots.
+    And where an equation depends on several configurations, or on one of several robots.
     Curves stand in the place of second harmonics. All other extensions are selected again, with curves in the model;
     gravity stays if it was selected without them: waves can imitate it where joints were measured, but not elsewhere.
     ``fit`` is that of the model without curves that was selected, the first of ``trials``; ``stated`` are the names of
@@ -139,10 +137,7 @@ def _most_likely(
     beside = given(columns, curves)
     starts = [beside.at(np.array([beside.centre[0], np.log(length), *plain.logs])) for length in STARTS]
     point = beside.optima([min(starts, key=lambda point: point.value)], ACCURACY)[0]
-    spacing = np.mean(travel[joints]) / len(np.unique(problem.data.configuration))
-    if plain.value - point.value <= GAIN or np.exp(point.logs[1]) < CONNECTED * spacing:
-        return None
-    return point, curves, columns
+    return (point, curves, columns) if plain.value - point.value > GAIN else None
 
 
 def _integrated(evidence: Evidence, columns: Array, point: Point) -> Evidence:

@@ -666,15 +666,21 @@ def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Ite
 def _in_place_of_extensions(result: Outcome, alone: CalibrationProblem) -> Iterator[str]:
     """Say what single change explains the rows better than the extensions of the model, which may take it up.
 
-    -2 ln L, whose fall by them is known, falls by m ln(1 / part) with a change that leaves a part of m squares.
+    -2 ln L, whose fall by them is known, falls by m ln(1 / part) with a change that leaves a part of m squares, and
+    rises by 2 ln 2 for every row that is at either of two positions.
     """
     learned = result.learned
     if learned is None or not learned.added or not all(name.startswith(ARM) for name in learned.added):
         return
     bare = cast(CalibrationProblem, result.stated).on(alone.data)
     plain = min((trial.value for trial in learned.trials if not trial.extensions), default=np.inf)
-    most = np.exp((min(trial.value for trial in learned.trials) - plain) / result.program.model.equations)
-    yield from diagnosis.shown_by_residuals(bare, ridge_deviations(bare), most=min(diagnosis.MOVED, float(most)))
+    m, x = result.program.model.equations, ridge_deviations(bare)
+    most = float(np.exp((min(trial.value for trial in learned.trials) - plain) / m))
+    sides = min(diagnosis.TWO_KINDS, most**0.5 * 0.5 ** (len(bare.data) / m))
+    yield from first(
+        diagnosis.shown_by_residuals(bare, x, most=min(diagnosis.MOVED, most)),
+        diagnosis.two_positions(bare, x, sides),
+    )
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:

