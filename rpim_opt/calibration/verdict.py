@@ -27,6 +27,7 @@ from rpim_opt.problem.diagnosis import ANGULAR, NOISY, NOTICED, REACH, SLIGHT, d
 from rpim_opt.problem.misreadings import Better, better_interpretation, sibling
 from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
 from rpim_opt.problem.row_functions import measured_torques
 from rpim_opt.robot.mdh import MDH, Robot, numbered
@@ -46,6 +47,7 @@ MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), 
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
 UNUSUAL = {"length": 0.004, "angle": 0.05}
 """Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
+PRINTED = 0.002  # common deviation of the longest link [m] from which a board of another size is the likelier reason
 ALIKE = 0.045  # part of an effect on the data that others may leave where these do not distinguish them
 DEPENDENT = 1e-6  # singular value of effects, over the largest, below which they are combinations of the others
 TAKES_PART = 0.1  # part of the largest share in an effect from which on a frame parameter is named
@@ -153,14 +155,33 @@ def like_a_frame(result: Outcome) -> str:
     least = [UNUSUAL.get(dimension, np.inf) for dimension in free.dimensions]
     size = np.where(free.of_frames, 0.0, np.abs(result.x) / least)
     worst = int(size.argmax())
-    frames = _taking_part(result, worst) if result.problem.keeps_rows and size[worst] >= 1 else []
-    if not frames:
-        return ""
+    stated = _taking_part(result, worst) if result.problem.keeps_rows and size[worst] >= 1 else []
+    if not stated:
+        return _like_a_board(result)
     return (
         f"{free.names[worst]} deviates by {in_unit(result.x[worst], free.dimensions[worst])}, which the data do not "
-        f"distinguish from an error of the stated {joined(frames)}: check it. If it is wrong, this robot is right only "
+        f"distinguish from an error of the stated {joined(stated)}: check it. If it is wrong, this robot is right only "
         "together with it."
     )
+
+
+def _like_a_board(result: Outcome) -> str:
+    """Return a sentence if all lengths of a robot deviate alike, where they follow from the size of a board."""
+    free = result.problem.parameters.free
+    nominal = np.where((np.array(free.dimensions) == "length") & ~free.of_frames, free.nominal, 0.0)
+    stretch = float(nominal @ result.x / max(nominal @ nominal, TINY))
+    if np.abs(stretch * nominal).max() < PRINTED or not scaled_by_board(result):
+        return ""
+    return (
+        f"Lengths of the robot deviate by {100 * stretch:+.2g} % in common, as with a board of another size, which "
+        "views do not identify: measure it over all its squares. If it is wrong, this robot is wrong by as much."
+    )
+
+
+def scaled_by_board(result: Outcome) -> bool:
+    """Return whether all lengths follow from the stated size of a camera's board: an error scales the robot with it."""
+    cameras, blocks = camera_blocks(result.problem.sample().data), result.problem.sample().data.blocks
+    return len(cameras) == len(blocks) and not any("stretch" in name for name in result.problem.parameters.free.names)
 
 
 def _taking_part(result: Outcome, k: int) -> list[str]:

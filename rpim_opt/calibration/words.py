@@ -14,7 +14,7 @@ from rpim_opt.bayes.hyperparameters import Hyperparameter, Learned
 from rpim_opt.bayes.prior import BASE, SESSIONS
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import transmission_errors
-from rpim_opt.calibration.verdict import REPEATABILITY, Verdict
+from rpim_opt.calibration.verdict import REPEATABILITY, Verdict, scaled_by_board
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.diagnosis import hardly_moved
 from rpim_opt.problem.noise import UNITS, in_unit
@@ -330,7 +330,7 @@ def camera_remarks(result: Outcome) -> list[str]:
                 "These views do not improve this robot: use its nominal parameters. Views from farther apart, with the "
                 "board nearer or larger, or an instrument that measures positions would."
             )
-    if not any("stretch" in name for name in result.problem.parameters.free.names):
+    if scaled_by_board(result):
         remarks.append(
             "Views do not identify the size of the board: an error in it scales the robot by the same factor. Measure "
             "the board over all its squares, or identify board_stretch_x and board_stretch_y."

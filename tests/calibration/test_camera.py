@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import tomllib
 from dataclasses import replace
 from functools import cache
@@ -64,6 +65,19 @@ def test_a_result_tells_reprojection_from_positions() -> None:
     assert found.improves
     world = STUDY._shape(instance.problem, result.x, np.zeros_like(result.x))
     assert found.before == pytest.approx(world, rel=0.2)
+
+
+def test_a_board_of_another_size_is_a_condition(tmp_path: Path) -> None:
+    """Its squares are stated 1 % too large, and so all links become; with the right ones nothing is said."""
+    folder = shutil.copytree(FOLDER, tmp_path / "camera")
+    problem = (folder / "problem.toml").read_text()
+    (folder / "problem.toml").write_text(problem.replace("spacing_mm = 40 ", "spacing_mm = 40.4 "))
+    instance = ro.load(folder)
+    caution = ro.calibrate(instance.problem, "tikhonov", weight="learned").verdict.caution
+    stretch = re.match(r"Lengths of the robot deviate by \+(0\.\d+) % in common", caution)
+    assert stretch
+    assert 0.7 < float(stretch[1]) < 1.3
+    assert not calibrated()[1].verdict.caution
 
 
 @pytest.mark.slow
