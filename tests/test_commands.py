@@ -30,7 +30,7 @@ from rpim_opt.robot.library import read_arm
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.use.validation import validate
 from tests import SHARED
-from tests.robot.test_exchange import CONF, YAML_PLAIN
+from tests.robot.test_exchange import CONF, YAML
 from tests.simulate import ARM, simulated
 from tests.test_cli import run
 
@@ -515,7 +515,7 @@ def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path
     assert np.abs(ro.read_robot(tmp_path / "arm.json").mdh - ro.load_result(made / "results").robot.mdh).max() < 1e-11
     assert f"digest {json.loads(result)['digest'][:12]}." in json.loads(written)["source"]
     assert "lacks base and tool: base x" in json.loads(written)["source"]
-    (tmp_path / "ros.yaml").write_text(YAML_PLAIN)
+    (tmp_path / "ros.yaml").write_text(YAML)
     outs = ["--mdh", str(tmp_path / "again.json"), "--out", str(tmp_path / "both")]
     sources = ["--urdf", str(cell / "arm.urdf"), "--ur-kinematics", str(tmp_path / "ros.yaml")]
     assert run(monkeypatch, "export", str(made / "results"), *sources, *outs) == 2  # of another robot
@@ -630,7 +630,7 @@ def test_a_robot_from_ros_base_link_is_written_in_the_controllers_base(tmp_path:
     ur10 = ro.read_robot(Path(ro.__file__).parent / "robot" / "ready" / "ur10.toml")
     conf, yaml = tmp_path / "calibration.conf", tmp_path / "kinematics.yaml"
     conf.write_text(CONF)
-    yaml.write_text(YAML_PLAIN)
+    yaml.write_text(YAML)
     drawn = ro.robot.read_ur_kinematics(yaml).robot
     change = 1e-3 * np.random.default_rng(0).normal(size=(6, 5))
     change[0, :2], change[:, 4] = 0, 0

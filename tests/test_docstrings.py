@@ -17,7 +17,7 @@ from matplotlib import pyplot
 
 import rpim_opt as ro
 from tests import ROOT
-from tests.robot.test_exchange import CONF, YAML_PLAIN
+from tests.robot.test_exchange import CONF, YAML
 
 mpl.use("agg")
 PACKAGE = ROOT / "rpim_opt"
@@ -27,7 +27,7 @@ URDF = """<robot name="arm"><link name="base"/><link name="arm"/><link name="tip
 <limit lower="-2" upper="2"/></joint>
 <joint name="flange" type="fixed"><parent link="arm"/><child link="tip"/><origin xyz="0.4 0 0"/></joint></robot>
 """
-FILES = {"targets.csv": TARGETS, "arm.urdf": URDF, "kinematics.yaml": YAML_PLAIN, "calibration.conf": CONF}
+FILES = {"targets.csv": TARGETS, "arm.urdf": URDF, "kinematics.yaml": YAML, "calibration.conf": CONF}
 """What a user has in the folder, to whom an example reads a file."""
 
 NAMESPACES = ("select", "constraints", "plot", "baselines")

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
-from tests.robot.test_exchange import CONF, UR10, YAML_PLAIN, configurations, reach, yaml_kinematics
+from tests.robot.test_exchange import CONF, UR10, YAML, configurations, reach, yaml_kinematics
 from tests.simulate import simulated
 
 
@@ -35,7 +35,7 @@ def test_files_of_universal_robots_state_the_tcp_and_the_base_that_belong_to_the
 ) -> None:
     """File, TCP and Base together are the calibrated robot, whichever base and table frame it was calibrated with."""
     path, target = tmp_path / file, tmp_path / f"new_{file}"
-    path.write_text(CONF if file.endswith("conf") else YAML_PLAIN)
+    path.write_text(CONF if file.endswith("conf") else YAML)
     nominal = UR10 if file.endswith("conf") else ro.robot.read_ur_kinematics(path).robot
     standing = nominal.mdh.copy()
     if ros:  # base_link, half a turn from the controller's Base

@@ -31,7 +31,7 @@ from rpim_opt.robot.mdh import Robot
 JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 DELTAS = {"theta": "delta_theta", "d": "delta_d", "a": "delta_a", "alpha": "delta_alpha"}
 SIX = ("x", "y", "z", "roll", "pitch", "yaw")
-LINE = re.compile(rb"^( *)([A-Za-z_]\w*):[ \t]*([^\s#]*)[ \t]*(?:#.*)?\r?$")
+PAIR = re.compile(rb"([A-Za-z_]\w*)[ \t]*:(?:[ \t]+|$|(?=\{))([^\s,{}]*)")  # also of a mapping {x: 0, y: 0}
 
 
 def _number(text: bytes, where: str) -> float:
@@ -201,24 +201,22 @@ def _yaml_chain(data: bytes) -> tuple[Chain, dict[tuple[str, str], tuple[int, in
     values: dict[tuple[str, str], float] = {}
     places: dict[tuple[str, str], tuple[int, int]] = {}
     joint = ""
-    for number, place in enumerate(re.finditer(rb"^.*$", data, re.MULTILINE), start=1):
+    for number, place in enumerate(re.finditer(rb"^[^#\r\n]*", data, re.MULTILINE), start=1):
         line = place[0]
-        if not line.strip() or line.lstrip().startswith((b"#", b"---")):
-            continue
-        match = LINE.match(line)
-        if match is None:
+        if PAIR.sub(b"", line).strip(b" \t,{}") not in (b"", b"---"):
             found = repr(line.decode(errors="replace").strip()[:40])
-            raise InputError(f"line {number}", found, "one 'key: value' per line")
-        key = match[2].decode()
-        if not match[3]:
-            joint = key
-            if key not in ("kinematics", *JOINTS):
-                raise InputError(f"line {number}", f"'{key}'", choices(key, JOINTS))
-        elif key in SIX:
-            if joint not in JOINTS or (joint, key) in values:
-                raise InputError(f"line {number}", f"{joint}.{key} twice or out of place", "each joint once")
-            values[joint, key] = _number(match[3], f"line {number}, {joint}.{key}")
-            places[joint, key] = (place.start() + match.start(3), place.start() + match.end(3))
+            raise InputError(f"line {number}", found, "'key: value', or {key: value, ...}")
+        for match in PAIR.finditer(line):
+            key = match[1].decode()
+            if not match[2]:
+                joint = key
+                if key not in ("kinematics", *JOINTS):
+                    raise InputError(f"line {number}", f"'{key}'", choices(key, JOINTS))
+            elif key in SIX:
+                if joint not in JOINTS or (joint, key) in values:
+                    raise InputError(f"line {number}", f"{joint}.{key} twice or out of place", "each joint once")
+                values[joint, key] = _number(match[2], f"line {number}, {joint}.{key}")
+                places[joint, key] = (place.start() + match.start(2), place.start() + match.end(2))
     missing = [f"{joint}.{key}" for joint in JOINTS for key in SIX if (joint, key) not in values]
     if missing:
         raise InputError(f"key {missing[0]}", "nothing", "a number [m or rad]")
