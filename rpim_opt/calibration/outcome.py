@@ -119,10 +119,11 @@ class Outcome:
 
         Without constraints the sum of squares falls by chi-square of as many degrees of freedom as are active, if they
         hold for the robot, times the residuals' variance where that is larger than the noise. Of a robust loss they
-        are the squares of what it keeps without constraints.
+        are the squares of what it keeps without constraints. A penalty that is not quadratic is no prior: it must not
+        be what falls alone, and parameters at its kinks count as active.
         """
         program = self.program
-        if not (self.formulation.solvable and program.linear_penalty) or self.moves is None:
+        if not self.formulation.solvable or self.moves is None:
             return ""
         bare = pose(replace(program.formulation, constraints=()), program.model)
         try:
@@ -133,15 +134,18 @@ class Outcome:
         sums = [float(np.sum((kept.A @ z - kept.b) ** 2)) + kept.offset for z in (self.z, best)]
         penalties = [self.penalty_weight * bare.value(z, self.weight)[1] for z in (self.z, best)]
         held, without = np.add(sums, penalties).tolist()
+        fall = held - without if program.linear_penalty else min(held - without, sums[0] - sums[1])
         active = len(self.z) - self.moves.shape[1]
         variance = max(1.0, without / max(program.model.equations - len(self.z), 1))
-        if chdtrc(active, max(held - without, 0.0) / variance) > CONTRADICTED:
+        if chdtrc(active, max(fall, 0.0) / variance) > CONTRADICTED:
             return ""
         names = joined([name_of(constraint, k) for k, constraint in enumerate(self.formulation.constraints)])
+        conditional = (
+            "" if self.no_intervals else "Standard deviations and intervals are conditional on them and too small. "
+        )
         return (
             f"The data contradict constraints ({names}): without them the objective is {three_digits(without)} instead "
-            f"of {three_digits(held)}. Standard deviations and intervals are conditional on them and too small; check "
-            "the drawing and the nominal robot, or loosen them."
+            f"of {three_digits(held)}. {conditional}Check the drawing and the nominal robot, or loosen them."
         )
 
     # --- the robot that was found ------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from rpim_opt.bayes.prior import Prior
 from rpim_opt.calibration import identify
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.arguments import arguments_of
-from rpim_opt.convex.constraints import Box, Parsed
+from rpim_opt.convex.constraints import Box, Constraint, Parsed
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.data.dataset import Dataset
@@ -54,7 +54,7 @@ class Instance(Tabled):
     the data, with the validation data; ``published`` are mean errors [mm] that the source prints for the same table, by
     role (identification, validation) and method; ``reference`` figures that a run must reproduce, by name, (value,
     tolerance); ``held_out`` is whether the validation data were drawn from the same table: once they have validated,
-    all rows are used.
+    all rows are used. ``constraints`` are the file's own, which hold beside every ready formulation.
     """
 
     problem: CalibrationProblem
@@ -67,6 +67,7 @@ class Instance(Tabled):
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     reference: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     held_out: bool = False
+    constraints: tuple[Constraint, ...] = ()
 
     @property
     def validation(self) -> Dataset | None:
@@ -85,8 +86,12 @@ class Instance(Tabled):
     def calibrate(self, **changes: Any) -> Calibration:
         """Return the calibration with the folder's settings and record.
 
-        ``changes`` are arguments of `calibrate` to use instead: ``weight="reml"``, ``formulation=ro.robust``.
+        ``changes`` are arguments of `calibrate` to use instead: ``weight="reml"``, ``formulation="robust"``, which has
+        the file's constraints, too, as a `Formulation` has not.
         """
+        if isinstance(changes.get("formulation"), str):
+            ready = formulation_of(changes["formulation"])
+            changes["formulation"] = replace(ready, constraints=(*ready.constraints, *self.constraints))
         settings = {name: getattr(self, name) for name in ("formulation", "weight", "prior", "model", "noise")}
         return replace(identify.calibrate(self.problem, **(settings | changes)), record=self.record)
 
@@ -171,6 +176,7 @@ def load(
         published={role: table.published.get(names[0], {}) for role, names in files.items() if names},
         reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
         held_out=table.held_out,
+        constraints=formulation.constraints[len(formulation_of(table.formulation).constraints) :],
     )
 
 

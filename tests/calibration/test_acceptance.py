@@ -319,6 +319,19 @@ def test_a_drawing_that_the_data_contradict_accepts_no_robot(instance, loss) -> 
         assert (found.verdict == "inconclusive") == contradicted, found
 
 
+def test_a_drawing_that_the_data_contradict_is_a_condition_of_any_penalty(instance) -> None:
+    """Zero, two and twelve standard deviations away from what lasso finds without it."""
+    free = ro.calibrate(instance.problem)
+    k = free.problem.parameters.free.names.index("d4")
+    sd = float(np.sqrt(free.covariance[k, k]))
+    without = ro.calibrate(instance.problem, ro.lasso, 1.0)
+    for sigmas in (0.0, 2.0, 12.0):
+        value = 1e3 * (free.problem.parameters.free.nominal[k] + without.x[k] - sigmas * sd)
+        limits = (ro.constraints.parse(f"d4 <= {value:.6f} mm"),)
+        verdict = ro.calibrate(instance.problem, replace(ro.lasso, constraints=limits), 1.0).verdict
+        assert ("The data contradict constraints" in verdict.caution) == (sigmas > 10), verdict
+
+
 # --- all rows ----------------------------------------------------------------------------------------------------
 
 

@@ -57,6 +57,23 @@ def test_reports_say_what_statements_cost(tmp_path: Path) -> None:
     assert sentence in str(result)
 
 
+def test_constraints_of_a_folder_hold_beside_every_ready_formulation(folder: Path) -> None:
+    """As ``calibrate --formulation`` names it; a formulation of a script is taken as it is."""
+    stating(
+        folder, '\n[variant.held.constraints]\nat_nominal = ["a3", "d5"]\n[variant.held.tolerance]\nlength_mm = 5\n'
+    )
+    instance = ro.load(folder, "held")
+    free = instance.problem.parameters.free
+    k = [free.names.index(name) for name in ("a3", "d5")]
+    for name in ("tikhonov", "lasso", "bounded"):
+        assert instance.calibrate(formulation=name, weight=1.0).x[k] == pytest.approx(0, abs=1e-12)
+    assert np.abs(instance.calibrate(formulation=ro.lasso, weight=1.0).x[k]).max() > 1e-5
+    (own,) = instance.constraints
+    assert ro.load(folder).constraints == ()
+    bounded = ro.load(folder, "held").calibrate(formulation="bounded", weight=1.0).formulation
+    assert bounded.constraints == (*ro.bounded.constraints, own)
+
+
 def test_places_are_joint_values_boxes_and_rows(folder: Path) -> None:
     stating(
         folder,
