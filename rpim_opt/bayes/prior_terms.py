@@ -210,17 +210,17 @@ class Statement:
         values = np.array(self.values, dtype=float)
         if self.whole:
             rows, values = marginal(rows, values, own[identified])
-            values = values - rows @ offset[identified]
+            place, offset = place[identified], offset[identified]
         else:
-            values = values - rows[:, own] @ offset
-            rows = rows[:, own[identified]]
-        column = (np.cumsum(parameters.identified) - 1)[place[identified]]
-        full = np.zeros((len(rows), len(parameters.free)))
-        full[:, column] = rows * parameters.scale[place[identified]]
-        replaced = np.zeros(full.shape[1], dtype=bool)
-        replaced[column] = self.whole
+            rows = rows[:, own]
+        values = values - rows @ offset
+        full, replaced = np.zeros((len(rows), len(parameters))), np.zeros(len(parameters), dtype=bool)
+        full[:, place], replaced[place] = rows, self.whole
+        if self.reference is not None and not self.whole:
+            full = full @ parameters.slopes()
+        full = (full * parameters.scale)[:, parameters.identified]
         says = full.any(axis=1)
-        return full[says], values[says], replaced
+        return full[says], values[says], replaced[parameters.identified]
 
     def _require_near(self, parameters: Parameters, place: np.ndarray, own: np.ndarray, offset: Array) -> None:
         """Refuse turned frames, and values far from nominal."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
@@ -263,14 +263,30 @@ class Parameters(Tabled):
         parent's axes (`kinematics.frame`): there the angles of the composed rotation.
         """
         result = self.nominal + x
+        for angles in self._orientations():
+            moved = numeric_frame([0, 0, 0, *x[angles]]) @ numeric_frame([0, 0, 0, *self.nominal[angles]])
+            result[angles] = roll_pitch_yaw(moved[:3, :3])
+        return result
+
+    def _orientations(self) -> Iterator[list[int]]:
+        """Yield where roll, pitch and yaw of every frame stand that has all of them; others cannot be composed."""
         index = {name: i for i, name in enumerate(self.names)}
         for first in [name for name in self.names if name.endswith("_rx")]:
             angles = [first[:-1] + axis for axis in "xyz"]
-            # a frame of which a table holds but some angles cannot be composed
             if index.keys() >= set(angles):
-                triple = [index[name] for name in angles]
-                moved = numeric_frame([0, 0, 0, *x[triple]]) @ numeric_frame([0, 0, 0, *self.nominal[triple]])
-                result[triple] = roll_pitch_yaw(moved[:3, :3])
+                yield [index[name] for name in angles]
+
+    def slopes(self) -> Array:
+        """Return the derivatives (n, n) of `values` by deviations, at zero.
+
+        The identity, but for roll, pitch and yaw, by which a frame turns about Rz Ry e_x, Rz e_y and e_z.
+        """
+        result = np.eye(len(self))
+        for angles in self._orientations():
+            _, pitch, yaw = self.nominal[angles]
+            c, s = np.cos(yaw), np.sin(yaw)
+            axes = [[c * np.cos(pitch), -s, 0], [s * np.cos(pitch), c, 0], [-np.sin(pitch), 0, 1]]
+            result[np.ix_(angles, angles)] = np.linalg.pinv(axes)
         return result
 
     def values_at(self, x: Array) -> Array:

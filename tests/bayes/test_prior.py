@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
 
 import cvxpy as cp
@@ -184,6 +185,22 @@ def test_values_of_parameters_count_from_nominal() -> None:
     by_deviation = Prior.known("a3 + a2 = nominal + 0.3 +- 0.05 mm").stated(PROBLEM.parameters)
     assert by_value.values == pytest.approx(by_deviation.values, rel=1e-6)
     assert (by_value.rows == by_deviation.rows).all()
+
+
+def test_the_angle_of_a_turned_frame_is_its_own_and_no_turn_about_the_parents_axes() -> None:
+    """Roll and pitch of a base that is turned by 163 degrees about z: both as stated, to the second order."""
+    p = PROBLEM.parameters
+    nominal = np.where(np.array(p.names) == "base_rz", np.radians(163.0), p.nominal)
+    turned = dataclasses.replace(p, nominal=nominal)
+    angles = {axis: 1e3 * nominal[p.names.index(f"base_{axis}")] for axis in ("rx", "ry", "rz")}
+    stated = [("base_rx", angles["rx"] + 1.2), ("base_ry", angles["ry"] - 0.7), ("base_rz", angles["rz"] + 0.4)]
+    known = Prior()
+    for name, value in stated:
+        known &= Prior.known(f"{name} = {value:.6f} +- 0.01 mrad")
+    prior = known.stated(turned)
+    x = np.linalg.lstsq(prior.rows, prior.values, rcond=None)[0] * turned.free.scale
+    values = dict(zip(turned.free.names, 1e3 * turned.free.values(x), strict=True))
+    assert {name: values[name] for name, _ in stated} == pytest.approx(dict(stated), abs=2e-2)
 
 
 def test_what_is_not_identified_is_nominal_in_a_combination_and_unknown_in_a_distribution() -> None:
