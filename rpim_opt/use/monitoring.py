@@ -12,7 +12,7 @@ from scipy.special import fdtrc, fdtri, ndtr, ndtri
 
 from rpim_opt.basics.arrays import Array, finite_numbers
 from rpim_opt.basics.tables import columns_csv, records
-from rpim_opt.basics.text import joined, listed
+from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import noise_covariances
 from rpim_opt.calibration.result import Calibration
@@ -125,7 +125,7 @@ class Monitoring:
                 course = "steadily from the first to the last check"
             lines.append(
                 f"Best explained by {cause.kind} {self.drift.moved or cause.name}, {course}: chi-squared falls by "
-                f"{cause.gain:.1f}, p-value {cause.p_value:.2g}."
+                f"{three_digits(cause.gain)}, p-value {cause.p_value:.2g}."
             )
             if self.drift.others:
                 lines.append(f"A change of {joined(self.drift.others)} explains the checks as well: measure more.")

@@ -257,16 +257,12 @@ def update(
     matches = matching(free, reset, "update, reset") if reset else np.zeros(len(free), dtype=bool)
     released = tuple(np.array(free.names)[matches].tolist())
     say("comparing with the previous calibration")
-    elsewhere = "" if released else _base_elsewhere(result, problem, prior_inflation)
-    if elsewhere:
-        released = tuple(name for name in free.names if name.startswith(registration(free, data)))
-    # a frame that was reset may be anywhere: then it is registered again
-    start = None if released else previous_deviations(result, problem)
+    problem, start, released, elsewhere = _registered_again(result, problem, released, prior_inflation)
     changes: list[Cause] = []
     first: tuple[tuple[Cause, ...], Fit] | None = None  # before anything is released
     while True:
         updated = _recalibrated(result, problem, released, prior_inflation, start)
-        causes, after = _weighed(result, updated, released)
+        causes, after = _weighed(result, updated.problem, updated.x, updated.formulation, released)
         first = first or (causes, after)
         # the most probable of the causes that chance does not explain
         cause = next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)
@@ -351,23 +347,37 @@ def _robots(result: Calibration) -> str:
     return " and ".join(robot.name for robot in result.problem.arms.values())
 
 
-def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation: float) -> str:
-    """Say where the base is and was, if readings that are displaced together put it out of its place; empty else."""
-    # evidence is linear in the deviations: of a base that turned far, it is none
+def _registered_again(
+    result: Calibration, problem: CalibrationProblem, released: tuple[str, ...], inflation: float
+) -> tuple[CalibrationProblem, Array | None, tuple[str, ...], str]:
+    """Return the problem, its nominal base where readings put it, a start (n,) [SI] or None, and what is released.
+
+    And a sentence on where the base is and was, where readings that are displaced together put it out of its place.
+    """
+    # evidence is linear in the deviations, and scales are about the nominal base: of one that turned far, both are none
     free, data = problem.parameters.free, problem.data
     place = registration(free, data)
-    base = [name for name in free.names if name.startswith(place)]
-    if not base or not displacement(result, problem.data, held_out_errors(result, problem.data))[0]:
-        return ""
-    registered = _recalibrated(result, problem, base, inflation, None)
+    base = tuple(name for name in free.names if name.startswith(place))
+    start = None if released else previous_deviations(result, problem)
+    if not released and not (base and displacement(result, data, held_out_errors(result, data))[0]):
+        return problem, start, released, ""
+    again = released or base
+    registered = _recalibrated(result, problem, again, inflation, None)
     session = "" if place == BASE else str(data.session[0])
     was, now = (np.array(frame_numbers(base_frame(each, "", session))) for each in (result, registered))
     if same_place(was, now):
-        return ""
-    return (
+        return problem, start, released, ""
+    start = None
+    if place == BASE and {*base} <= {*again}:
+        p = registered.problem.parameters
+        nominal = np.where(np.isin(p.names, base), p.values_at(registered.x), p.nominal)
+        problem = problem.with_parameters(replace(p, nominal=nominal))
+        start = np.where(np.isin(free.names, base), 0.0, registered.x)
+    said = (
         f"The instrument or the base moved: in the instrument's frame the base is at {placed(now)}, previously at "
         f"{placed(was)}. It was registered again, as with --reset '{place}*'."
     )
+    return problem, start, again, "" if released else said
 
 
 def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
@@ -397,9 +407,9 @@ def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple
 
 
 def _changes(result: Calibration, data: Dataset) -> tuple[tuple[Cause, ...], Fit]:
-    """Return all that may have changed before new measurements, as of `_weighed`, nothing released."""
+    """Return all that may have changed before new measurements, as of `_weighed`, at the previous deviations."""
     problem = with_data(result, data)
-    return _weighed(result, _recalibrated(result, problem, (), 1.0, previous_deviations(result, problem)), ())
+    return _weighed(result, problem, previous_deviations(result, problem), posterior_as_prior(result, problem), ())
 
 
 def _moved(
@@ -429,10 +439,9 @@ def _moved(
         moved.append(Moved(name, free.dimensions[i], float(change), float(std)))
     if not changed:
         return tuple(moved)
-    problem = with_data(result, updated.problem.data)
     index = [free.names.index(name) for name in changed]
-    penalty = penalty_of(posterior_as_prior(result, problem, reset), len(free))
-    misfit = Misfit(result, problem.linearize(updated.x), penalty)
+    penalty = penalty_of(posterior_as_prior(result, updated.problem, reset), len(free))
+    misfit = Misfit(result, updated.problem.linearize(updated.x), penalty)
     g, G = misfit.projected(slice(misfit.m), misfit.A[:, index])
     covariance = free.scale[index, None] * np.linalg.pinv(G, hermitian=True) * free.scale[index]
     change, std = covariance @ (g / free.scale[index]), np.sqrt(np.diag(covariance))
@@ -457,14 +466,14 @@ def with_data(result: Calibration, data: Dataset) -> CalibrationProblem:
     return identifying_sessions(problem.on(data))
 
 
-def previous_deviations(result: Calibration, problem: CalibrationProblem) -> Array:
+def previous_deviations(result: Calibration, problem: Source) -> Array:
     """Return the result's deviations (n,) [SI] of a problem's parameters, zero where it does not know them."""
     known = dict(zip(result.problem.parameters.free.names, result.x.tolist(), strict=True))
     return np.array([known.get(name, 0.0) for name in problem.parameters.free.names])
 
 
 def posterior_as_prior(
-    result: Calibration, problem: CalibrationProblem, released: Sequence[str] = (), inflation: float = 1.0
+    result: Calibration, problem: Source, released: Sequence[str] = (), inflation: float = 1.0
 ) -> Formulation:
     """Return the result's loss and constraints with its posterior as penalty, wide for the released parameters."""
     free = problem.parameters.free
@@ -585,22 +594,23 @@ def candidates(free: Parameters, data: Dataset, reset: Sequence[str] = ()) -> li
     return causes + [Cause(*whole, tuple(names)) for whole, names in wholes.items()]
 
 
-def _weighed(result: Calibration, updated: Calibration, released: Sequence[str]) -> tuple[tuple[Cause, ...], Fit]:
-    """Return all causes with their evidence, the most probable first, and how well readings and prior fit."""
-    model = updated.program.model
-    free = updated.problem.parameters.free
-    prior = updated.program.penalty_form or identity(len(updated.x))
-    misfit = Misfit(result, model, prior, [free.names.index(name) for name in released])
-    width = prior_widths(result, updated.problem) / free.scale
+def _weighed(
+    result: Calibration, problem: Source, x: Array, prior: Formulation, released: Sequence[str]
+) -> tuple[tuple[Cause, ...], Fit]:
+    """Return all causes with their evidence at x (n,) [SI], the most probable first, and how well all fits."""
+    free = problem.parameters.free
+    model = problem.linearize(x)
+    misfit = Misfit(result, model, penalty_of(prior, len(x)), [free.names.index(name) for name in released])
+    width = prior_widths(result, problem) / free.scale
     causes: list[Cause] = []
     logs: list[float] = []
-    for cause in candidates(free, updated.problem.data, released):
+    for cause in candidates(free, problem.data, released):
         index = [free.names.index(name) for name in cause.members]
         change = misfit.projected(slice(misfit.m, None), misfit.L[:, index])
         causes.append(misfit.evidence(cause, *change))
         logs.append(log_bayes_factor(*change, width[index]))
     rows: dict[int, list[str]] = {}  # a configuration may have been measured wrongly
-    for part in updated.problem.rows():
+    for part in problem.rows():
         for label, configuration in zip(part.data.label, part.data.configuration, strict=True):
             rows.setdefault(int(configuration), []).append(label)
     for number, labels in rows.items():

@@ -91,6 +91,18 @@ def test_a_base_that_moved_is_no_link_that_grew(moved: tuple[float, ...], names:
     assert "the instrument or the base moved" in str(found)
 
 
+def test_a_base_far_away_is_compared_without_a_fit(caplog) -> None:
+    """A fit of a robot that did not move took 256 iterations, and figures of the comparison eleven digits."""
+    result, data = checked(3, np.zeros(CHECKS))
+    (block,) = data.blocks
+    y = block.y @ Rotation.from_rotvec([0.0, 0.0, 1.7]).as_matrix().T + np.array([-1.5, 4.2, -0.1])
+    with caplog.at_level("INFO", logger="rpim_opt"):
+        found = ro.use.monitor(result, replace(data, blocks=(replace(block, y=y),)))
+    assert found.mistake.startswith("Likely: the instrument or the base moved.")
+    assert "iteration" not in caplog.text
+    assert re.search(r"frame base, before the first check: chi-squared falls by [1-9]\d\d,000,000", str(found))
+
+
 def test_an_instrument_that_was_set_up_anew_is_no_change_of_the_arm_where_the_base_was_not_identified() -> None:
     """The checks' frame was the robot's own: a link of 0.5 mm more, or of 0.3 m, was named."""
     instance = ro.load("paper_arm")
