@@ -53,7 +53,8 @@ def admitted(
 ) -> tuple[Fit, tuple[Trial, ...], float] | None:
     """Return the fit with transmission errors, the models compared, and the decrease of -2 ln L; None if too small.
 
-    And where an equation depends on several configurations, or on one of several robots.
+    And where an equation depends on several configurations, or on one of several robots, and where curves correlate
+    over more than the joints turned: then they are joint zeros that were not to be identified.
     Curves stand in the place of second harmonics. All other extensions are selected again, with curves in the model;
     gravity stays if it was selected without them: waves can imitate it where joints were measured, but not elsewhere.
     ``fit`` is that of the model without curves that was selected, the first of ``trials``; ``stated`` are the names of
@@ -137,7 +138,9 @@ def _most_likely(
     beside = given(columns, curves)
     starts = [beside.at(np.array([beside.centre[0], np.log(length), *plain.logs])) for length in STARTS]
     point = beside.optima([min(starts, key=lambda point: point.value)], ACCURACY)[0]
-    return (point, curves, columns) if plain.value - point.value > GAIN else None
+    if plain.value - point.value <= GAIN or np.exp(point.logs[1]) > np.max(travel[joints]):
+        return None
+    return point, curves, columns
 
 
 def _integrated(evidence: Evidence, columns: Array, point: Point) -> Evidence:

@@ -362,12 +362,13 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     repeatability, least = repeatability_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += missed
     if least > limit:
-        selected = result.learned is not None and result.learned.trials
-        model = "" if selected else 'a model that explains more of the residuals (model = "auto") or '
-        against.append(
-            f"With this model the robot's repeatability alone contributes at least {1e3 * least:.3f} mm; only {model}a "
-            "more repeatable robot reduces it."
-        )
+        fit = judged(result)
+        if fit is not None and fit.repeated is not None:
+            what, remedy = "the robot's repeatability alone contributes", "only a more repeatable robot reduces it"
+        else:
+            what = "the robot's repeatability, or an effect that the model lacks, contributes"
+            remedy = "repeat five configurations, approached from both sides, to separate them, and measure others"
+        against.append(f"With this model {what} at least {1e3 * least:.3f} mm: {remedy}.")
     if not mapped.largest <= limit:
         lacking.append(_missing(result, limit, mapped, repeatability))
     verdict: Conclusion = "accepted"

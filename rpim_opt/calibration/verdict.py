@@ -47,7 +47,8 @@ MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), 
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
 UNUSUAL = {"length": 0.004, "angle": 0.05}
 """Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
-PRINTED = 0.002  # common deviation of the longest link [m] from which a board of another size is the likelier reason
+SCALED = 0.002  # common deviation of the longest link [m] from which a wrong scale is the likelier reason,
+SIGMAS, COMMON = 3.0, 0.6  # its standard deviations, as lengths deviate by chance, and its part of what they deviate
 ALIKE = 0.045  # part of an effect on the data that others may leave where these do not distinguish them
 DEPENDENT = 1e-6  # singular value of effects, over the largest, below which they are combinations of the others
 TAKES_PART = 0.1  # part of the largest share in an effect from which on a frame parameter is named
@@ -157,7 +158,7 @@ def like_a_frame(result: Outcome) -> str:
     worst = int(size.argmax())
     stated = _taking_part(result, worst) if result.problem.keeps_rows and size[worst] >= 1 else []
     if not stated:
-        return _like_a_board(result)
+        return _like_a_scale(result)
     return (
         f"{free.names[worst]} deviates by {in_unit(result.x[worst], free.dimensions[worst])}, which the data do not "
         f"distinguish from an error of the stated {joined(stated)}: check it. If it is wrong, this robot is right only "
@@ -165,21 +166,33 @@ def like_a_frame(result: Outcome) -> str:
     )
 
 
-def _like_a_board(result: Outcome) -> str:
-    """Return a sentence if all lengths of a robot deviate alike, where they follow from the size of a board."""
-    free = result.problem.parameters.free
-    nominal = np.where((np.array(free.dimensions) == "length") & ~free.of_frames, free.nominal, 0.0)
-    stretch = float(nominal @ result.x / max(nominal @ nominal, TINY))
-    if np.abs(stretch * nominal).max() < PRINTED or not scaled_by_board(result):
+def _like_a_scale(result: Outcome) -> str:
+    """Return a sentence if the lengths of a robot deviate in common, as by the scale of what measured them."""
+    free, C = result.problem.parameters.free, result.known_covariance
+    if C is None:
         return ""
+    lengths = (np.array(free.dimensions) == "length") & ~free.of_frames & (free.nominal != 0) & np.isfinite(np.diag(C))
+    if not lengths.any():
+        return ""
+    nominal, x = free.nominal[lengths], result.x[lengths]
+    scale = free.scale if result.learned is None else result.learned.stated
+    precision = np.linalg.inv(C[np.ix_(lengths, lengths)] + np.diag(scale[lengths] ** 2))  # of deviations found
+    information = nominal @ precision @ nominal
+    stretch = float(nominal @ precision @ x / information)
+    chance = max(SIGMAS**2, COMMON * float(x @ precision @ x))
+    if np.abs(stretch * nominal).max() < SCALED or stretch**2 * information < chance:
+        return ""
+    what = "an instrument of another scale: check its units and its compensation"
+    if scaled_by_board(result):
+        what = "a board of another size, which views do not identify: measure it over all its squares"
     return (
-        f"Lengths of the robot deviate by {100 * stretch:+.2g} % in common, as with a board of another size, which "
-        "views do not identify: measure it over all its squares. If it is wrong, this robot is wrong by as much."
+        f"Lengths of the robot deviate by {100 * stretch:+.2g} % in common, as with {what}. "
+        "If that is wrong, this robot is wrong by as much."
     )
 
 
 def scaled_by_board(result: Outcome) -> bool:
-    """Return whether all lengths follow from the stated size of a camera's board: an error scales the robot with it."""
+    """Return whether the stated size of a camera's board is the only measure of lengths."""
     cameras, blocks = camera_blocks(result.problem.sample().data), result.problem.sample().data.blocks
     return len(cameras) == len(blocks) and not any("stretch" in name for name in result.problem.parameters.free.names)
 
@@ -578,7 +591,7 @@ def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: 
     if outliers:  # they bias the squares with which the fit is compared, and losses that are not robust
         rows = rows.without(outliers)
     plain = _worst_ratio(rows, ridge_deviations(rows))
-    if plain > NOISY:
+    if not 0 < plain <= NOISY:
         return []
     away = sorted(set(problem.labels).difference(rows.labels))
     if away and by_place(result.formulation, problem.groups):
@@ -687,21 +700,15 @@ def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Ite
 def _in_place_of_extensions(result: Outcome, alone: CalibrationProblem) -> Iterator[str]:
     """Say what single change explains the rows better than the extensions of the model, which may take it up.
 
-    -2 ln L, whose fall by them is known, falls by m ln(1 / part) with a change that leaves a part of m squares, and
-    rises by 2 ln 2 for every row that is at either of two positions.
+    -2 ln L, whose fall by them is known, falls by m ln(1 / part) with a change that leaves a part of m squares.
     """
     learned = result.learned
     if learned is None or not learned.added or not all(name.startswith(ARM) for name in learned.added):
         return
     bare = cast(CalibrationProblem, result.stated).on(alone.data)
     plain = min((trial.value for trial in learned.trials if not trial.extensions), default=np.inf)
-    m, x = result.program.model.equations, ridge_deviations(bare)
-    most = float(np.exp((min(trial.value for trial in learned.trials) - plain) / m))
-    sides = min(diagnosis.TWO_KINDS, most**0.5 * 0.5 ** (len(bare.data) / m))
-    yield from first(
-        diagnosis.shown_by_residuals(bare, x, most=min(diagnosis.MOVED, most)),
-        diagnosis.two_positions(bare, x, sides),
-    )
+    most = np.exp((min(trial.value for trial in learned.trials) - plain) / result.program.model.equations)
+    yield from diagnosis.shown_by_residuals(bare, ridge_deviations(bare), most=min(diagnosis.MOVED, float(most)))
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:

@@ -761,8 +761,8 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
     way from the row before, and the slopes of the scale or offset of lengths, of positions by the scales and skews of
     their axes, too. Else backlash, rows of two kinds, noise of one column and of some rows are looked for. Nothing is
     reported where gravity and eccentric gears explain more, which are not in the model: a lack of fit, and no mistake.
-    With ``most`` the addition is reported if it leaves at most that part of the squares, and nothing else is looked
-    for.
+    With ``most`` what leaves at most that part of the squares is reported, and else only backlash is looked for: a side
+    for every row raises -2 ln L by 2 ln 2. It is named in place of an addition that leaves twice as much.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
@@ -782,22 +782,22 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
     if problem.touches:  # lengths, without those that place the touched points
         angle = np.zeros(len(model.A), dtype=bool)
     best = _explained(model, x, angle, chain(moves, _gears(problem, model), _scales(problem, x, model)), most)
+    left, limit = np.inf if best is None else best[0], min(TWO_KINDS, acceptable)
     if single:
-        yield from _said_of_addition(best)
+        sides = min(limit, most**0.5 * 0.5 ** (len(problem.data) / len(model.b)), MOVED * left)
+        yield from first(two_positions(problem, x, sides), _said_of_addition(best))
         return
     # zeros of all joints fit two gross errors, whatever these are, but no more
     what, cause = "set of joint zeros", "did several joints slip, or were they remastered"
     changes = _changes(problem, x, model.A, _zeros(problem.robot), what, cause, _shares(problem))
     several = _explained(model, x, angle, changes, most)
-    left = np.inf if best is None else best[0]
     if several is not None and several[0] < SEVERAL * left:
         best, left = several, several[0]
     rows, part = _two_kinds(problem, x)
-    limit = min(TWO_KINDS, acceptable)
     # what changed at a row is named by itself where that is enough
     kinds = part < limit and left > (MOVED if np.ptp(rows) == len(rows) - 1 else part / MOVED)
     if best is not None and not kinds:
-        yield from _said_of_addition(best)
+        yield from first(two_positions(problem, x, min(limit, MOVED * left)), _said_of_addition(best))
     else:
         said = [_said_of_kinds(problem, rows, part)] if kinds else ()
         noise = _uneven_noise(problem, x) if acceptable == 1 else ()  # else errors are too large for noise

@@ -636,14 +636,12 @@ def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, 
     tools = re.compile(r"tool_.*" if any(kind.turning for kind in kinds) else r"tool_(.*_)?[xyz]")
     names = [name for name in parameters.names if geometry.fullmatch(name)]
     names += near_parallel(robot)
-    base = [name for name in parameters.names if name.startswith("base_")]
-    placed = any(kind.registers for kind in kinds)
-    # a user's type may depend on the base: distances do not, a fixture is placed by it
-    if base and not placed and not any(kind.points > 1 or kind.start or kind.touching for kind in kinds):
-        problem = CalibrationProblem(robot, parameters.identify([*base, "tool_*"]), data)
-        slopes = np.abs(problem.linearize(np.zeros(len(problem.parameters.free))).A)
-        of_base = np.isin(problem.parameters.free.names, base)
-        placed = bool(slopes[:, of_base].max() > RANK_TOLERANCE * slopes.max())
-    if placed:
-        names += base
-    return names + [name for name in parameters.names if tools.fullmatch(name) or name in own]
+    frames = [name for name in parameters.names if name.startswith("base_") or tools.fullmatch(name)]
+    # distances do not depend on the base, and a fixture is placed by it; of a user's type it is what has an effect
+    if not any(kind.registers or kind.points > 1 or kind.start or kind.touching for kind in kinds):
+        problem = CalibrationProblem(robot, parameters.identify(["base_*", "tool_*"]), data)
+        slopes = np.abs(problem.linearize(np.zeros(len(problem.parameters.free))).A).max(axis=0)
+        frames = np.array(problem.parameters.free.names)[slopes > RANK_TOLERANCE * slopes.max()].tolist()
+    elif not any(kind.registers for kind in kinds):
+        frames = [name for name in frames if not name.startswith("base_")]
+    return names + frames + [name for name in parameters.names if name in own]

@@ -275,6 +275,16 @@ def test_curves_stand_beside_any_noise(noise):
     assert "transmission error" in result.learned.extensions
 
 
+def test_curves_do_not_stand_for_joint_zeros_that_are_not_to_be_identified() -> None:
+    """A table of a controller that takes lengths alone; zeros that are wrong vary slowly, if at all."""
+    problem, _ = measured(0.0, configurations=60)
+    lengths = problem.identifying(np.isin(problem.parameters.names, ["a2", "a3", "d1", "d2", "d3"]))
+    zeros = np.where([name.startswith("theta") for name in problem.parameters.free.names], 5e-3, 0.0)
+    y = problem.modelled(zeros)[0]
+    wrong = lengths.on(ro.Dataset.of(problem.data.q, y, NOISE))
+    assert "transmission error" not in ro.calibrate(wrong, model="auto").learned.extensions
+
+
 @pytest.mark.parametrize("seed", [39, 44])
 def test_backlash_that_curves_take_up_is_named(seed: int) -> None:
     """Either of two positions explains the rows better than curves, which hid 1 mm of new rows."""

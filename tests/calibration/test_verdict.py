@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,6 +129,19 @@ def test_a_stated_tool_beside_the_last_axis_looks_like_its_joint_zero() -> None:
     assert verdict.delivered
     assert verdict.caution.startswith("theta6 deviates by 159 mrad")
     assert "an error of the stated tool_x: check it." in verdict.caution
+
+
+@pytest.mark.parametrize("error", [0.01, -0.03])
+def test_an_instrument_of_another_scale_looks_like_a_longer_robot(error: float) -> None:
+    """Positions in millimetres that are too long, in a frame of the instrument."""
+    problem = ro.load("position").problem
+    (block,) = problem.data.blocks
+    scaled = problem.on(replace(problem.data, blocks=(replace(block, y=(1 + error) * block.y),)))
+    verdict = ro.calibrate(scaled).verdict
+    said = re.search(r"Lengths of the robot deviate by ([-+.\d]+) % in common, as with an instrument", str(verdict))
+    assert said
+    assert float(said[1]) == pytest.approx(100 * error, rel=0.3)
+    assert not ro.calibrate(problem).verdict.caution
 
 
 def test_of_known_values_that_are_contradicted_the_wrong_one_comes_first() -> None:

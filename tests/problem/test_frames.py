@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -194,6 +195,25 @@ def test_a_base_may_be_a_transform_and_a_pattern_stand_alone() -> None:
     assert one.parameters.free.names == tuple(f"theta{k}" for k in range(1, 7))
     two = ro.problem_from(arm.robot, arm.data, ["theta?"], base=[1.8, -0.7, 0.35, 0.1, 0.2, 0.3])
     np.testing.assert_allclose(one.parameters.nominal, two.parameters.nominal, atol=1e-12)
+
+
+def test_of_a_users_type_the_frames_that_it_depends_on_are_identified() -> None:
+    """An inclinometer at the flange: its readings have no unit, and depend on no position and no heading."""
+    problem = ro.load("position").problem
+    tilt = ro.data.Measurement("tilt", model=lambda T: T[2, :2].T, columns={"tx": "", "ty": ""})
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-2, 2, (60, 6))
+    mdh = problem.robot.mdh + 1e-3 * rng.normal(size=problem.robot.mdh.shape) * [1, 0, 1, 0, 0]
+    turned = numeric_frame([0, 0, 0, 0.02, -0.01, 0.0]) @ ro.robot.forward_kinematics(
+        replace(problem.robot, mdh=mdh), q
+    )
+    y = (turned @ numeric_frame([0, 0, 0, 0.03, 0.02, -0.04]))[:, 2, :2] + 1e-4 * rng.normal(size=(60, 2))
+    problem = ro.problem_from(problem.robot, ro.Dataset.of(q, y, 1e-4, measurement=tilt), base=np.zeros(6))
+    frames = {name for name in problem.parameters.free.names if name.startswith(("base", "tool"))}
+    assert frames == {"base_rx", "base_ry", "tool_rx", "tool_ry", "tool_rz"}
+    result = ro.calibrate(problem)
+    assert result.verdict.delivered
+    assert np.std(problem.residual(result.x)) < 1.2e-4
 
 
 def test_a_problem_from_arrays_has_its_frames_where_the_data_put_them() -> None:

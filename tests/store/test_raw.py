@@ -439,6 +439,19 @@ def test_files_of_two_clocks_are_joined_by_the_nearest_time(monkeypatch, capsys,
     assert list(data.label) == [name[0] for name in NAMED]
 
 
+@pytest.mark.parametrize("key", [[], ["--key", "header.stamp.sec"]])
+def test_times_of_ros_in_two_columns_are_one(monkeypatch, capsys, tmp_path, arm, key) -> None:
+    files = clocked(tmp_path, rate=10.0, apart=0.003)
+    header, *lines = files[0].read_text().splitlines()
+    stamped = ["header.stamp.sec,header.stamp.nanosec," + header.partition(",")[2]]
+    for line in lines:
+        time, _, rest = line.partition(",")
+        stamped.append(f"{int(float(time))},{round(1e9 * (float(time) % 1))},{rest}")
+    files[0].write_text("\n".join(stamped))
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.06", *key) == 0
+    assert "times differ by 0.053 s at most" in capsys.readouterr().out
+
+
 def test_a_robot_that_moves_as_it_is_measured_is_named(monkeypatch, capsys, tmp_path, arm) -> None:
     """Joint 1 turns for 30 s at 20 degrees a second; measured is 0.02 s after a row of the log."""
     files = [tmp_path / "joints.csv", tmp_path / "points.csv"]

@@ -31,6 +31,8 @@ UNIT = re.compile(r"(.+?)[\s_]*[\[(/]?\s*\b(s|sec|secs|seconds|ms|us|µs|ns|nsec
 SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "μs": 1e-6, "ns": 1e-9,
            "nsec": 1e-9, "nsecs": 1e-9}  # fmt: skip
 """What a unit is in lower case (`str.casefold`)."""
+STAMP, NANOSECONDS = re.compile(r"(?i)(.*stamp[._/])secs?"), ("nsecs", "nsec", "nanosec")
+"""A time of ROS in two columns: its whole seconds, and endings of the other's name."""
 SAME = 0.8
 """Share of the shorter one's values that two columns of other names have in common where they are one key."""
 OTHER_KEYS = "--key row for rows in the same order, or --time-tolerance for the nearest time"
@@ -356,6 +358,12 @@ def _motion(joints: CanonicalTable, times: Array, start: Array, end: Array) -> A
 def _times(table: CanonicalTable, key: str) -> tuple[str, Array]:
     """Return the column of a table's times, the stated one if it has it, and the times [s] of its rows."""
     name = key.lower() if key.lower() in table.raw else time_column(table.raw)
+    for whole in table.raw if name is None else [name]:
+        match = STAMP.fullmatch(whole)
+        fractions = [table.raw.get(f"{match[1]}{ending}") for ending in NANOSECONDS] if match else []
+        for fraction in filter(None, fractions):
+            cells = zip(table.raw[whole], fraction, strict=True)
+            return whole, np.array([numeral(str(s)) + 1e-9 * numeral(str(ns)) for s, ns in cells])
     if name is None:
         columns = ", ".join(each.column for each in table.meant)
         found = f"no column of times among {columns}"
