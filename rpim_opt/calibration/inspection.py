@@ -20,7 +20,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.words import contact_remarks
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.design import Observability, observe
-from rpim_opt.problem.diagnosis import all_q, hardly_moved
+from rpim_opt.problem.diagnosis import all_q, beyond_limits, hardly_moved
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.frames import fitted_frames
@@ -221,11 +221,7 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
         if name not in problem.parameters.free.names:
             yield f"the axes {axis} and {axis + 1} are nearly parallel: add {name} to `identify`."
     q = all_q(problem.data)
-    for i, dimension in enumerate(robot.joint_dimensions):
-        unit, si = display(dimension)
-        low, high = robot.limits[i]
-        if q[:, i].min() < low - 1e-9 or q[:, i].max() > high + 1e-9:
-            yield f"joint {robot.joint(i)} exceeds its limits {low / si:.1f} to {high / si:.1f} {unit}."
+    yield from (f"{text}." for text in beyond_limits(robot, q))
     for moves in hardly_moved(robot, np.array([q.min(axis=0), q.max(axis=0)])):
         yield f"{moves}: its parameters are poorly identifiable."
     for block in problem.data.blocks:

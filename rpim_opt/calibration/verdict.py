@@ -64,6 +64,7 @@ UPWARD = 5.0  # standard deviations by which a compliance is below zero, which g
 NOTABLE = 0.5  # effect of a joint's compliance over the largest, below which wrong masses explain its sign
 ELSEWHERE = 0.5  # part of the residuals that identifying the base may leave before its statement is called wrong
 HOPELESS = 20.0  # residuals over the stated noise from which something is said even if nothing explains them
+OUTSIDE = 2.0  # ranges of a joint by which no other zero puts its values outside of its limits
 SCALES = 10.0  # scales by which a parameter of the robot may deviate
 LARGEST_CURVE = 0.01  # standard deviation of transmission errors [rad] beyond any gear: real ones are below 1 mrad
 LARGEST = {"length": 0.02, "angle": 0.05}  # a machined and assembled robot deviates by less than this [m, rad]
@@ -658,8 +659,10 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
     beyond = error >= LARGEST["length"]  # what a robot's own effects may be
     explained = max(ratio for _, ratio in residual_rms(result, kept).values()) < NOTICED
     most = REACH * arm_length(problem) if explained else np.inf  # else wrong lengths explain more
+    outside = diagnosis.beyond_limits(problem.robot, diagnosis.all_q(problem.data), OUTSIDE)
     # beside single rows, which may be the ones where something changed
     return first(
+        (f"{text}: check the unit and the column of its values." for text in outside),
         chain(diagnosis.single_rows(ordered), diagnosis.better_interpretations(ordered, most)),
         _shown_without_outliers(result, ordered),
         diagnosis.rounded(problem, error),

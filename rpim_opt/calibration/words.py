@@ -16,7 +16,7 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.calibration.verdict import REPEATABILITY, Verdict, scaled_by_board
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.problem.diagnosis import hardly_moved
+from rpim_opt.problem.diagnosis import all_q, hardly_moved, moved_one_by_one
 from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
@@ -180,6 +180,14 @@ def underdetermined(result: Outcome) -> list[str]:
         lines.append(
             f"Too little motion: {joined(still)}. The result holds only near the values that were measured there; "
             "before using others, measure configurations in which these joints move."
+        )
+    if any(
+        moved_one_by_one(arm, all_q(result.problem.sample().alone(name).data))
+        for name, arm in result.problem.arms.items()
+    ):
+        lines.append(
+            "In nearly all rows one joint alone differs from a common configuration, so that the data do not show how "
+            "joints act together: measure configurations in which all joints differ."
         )
     covariance = result.known_covariance
     if covariance is None:

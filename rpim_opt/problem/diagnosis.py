@@ -34,6 +34,7 @@ NOTICED = 2**0.5
 MANY_MINUTES, TAKEN_UP = 30, 0.05  # different decimals below .60 that are no chance, and what a model leaves of them
 MOVED = 0.5  # an instrument has moved if that leaves less than this part of the sum of squares
 SLIGHT = (5 / 6) ** 2  # what an effect that is worth a word leaves of it: errors without it are a sixth smaller
+ONE_BY_ONE = 0.9  # share of rows in which one joint alone is moved, from which how joints act together is unknown
 FAR_MOVED = 0.005
 """Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
 NOISY = 3.0  # residual RMS over the stated noise above which the fit is not that of the stated instrument
@@ -115,6 +116,24 @@ def hardly_moved(robot: Robot, measured: Array) -> list[str]:
             unit, si = display(dimension)
             lines.append(f"joint {robot.joint(i)} moves only {travel / si:.2f} {unit}")
     return lines
+
+
+def moved_one_by_one(robot: Robot, q: Array) -> bool:
+    """Return whether nearly all joint values (N, dof) differ from a common configuration in one joint alone."""
+    near = np.array([LEAST_TRAVEL[robot.joint_types[i]] / 10 for i in robot.leading])
+    away = np.abs(q - np.median(q, axis=0)) > near
+    return robot.dof > 1 and bool(np.mean(away.sum(axis=1) <= 1) > ONE_BY_ONE)
+
+
+def beyond_limits(robot: Robot, q: Array, by: float = 0.0) -> Iterator[str]:
+    """Say which joint values (N, dof) leave the joint's limits, ``by`` that many times their range."""
+    for i, dimension in enumerate(robot.joint_dimensions):
+        low, high = robot.limits[i]
+        least, largest = q[:, i].min(), q[:, i].max()
+        if max(low - least, largest - high) > max(by * (high - low), 1e-9):
+            unit, si = display(dimension)
+            measured, limits = (f"{a / si:,.6g} to {b / si:,.6g} {unit}" for a, b in ((least, largest), (low, high)))
+            yield f"joint {robot.joint(i)} is {measured}, but its limits are {limits}"
 
 
 def all_q(data: Dataset) -> Array:

@@ -287,7 +287,9 @@ def _of_poses() -> Iterator[Misreading]:
                 stated = f"state --rotation 'intrinsic {order}', or {remedy}"
                 yield turned(what, stated, euler(axes, ["xyz".index(axis) for axis in order]))
             if order != "xyz":  # KUKA's A, B, C for instance
-                yield turned(f"{what}, columns in this order", remedy, euler(axes))
+                turns = "intrinsic" if kind == "moving" else "extrinsic"
+                renamed = f"rename them r{', r'.join(order)} and state --rotation '{turns} {order}', or {remedy}"
+                yield turned(f"{what}, columns in this order", renamed, euler(axes))
     for sign in list(product((1.0, -1.0), repeat=3))[1:]:
         named = joined([name for name, each in zip(("rx", "ry", "rz"), sign, strict=True) if each < 0])
         yield turned(f"Euler angles with the other sign of {named}", "change it", euler("xyz", factor=sign))

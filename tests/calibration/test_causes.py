@@ -346,6 +346,11 @@ def test_joint_values_that_were_logged_as_16_bit_floats_are_named() -> None:
     assert any("joint values are rounded to up to 0.125 deg" in text for text in result.verdict.reasons), result.causes
 
 
+def approached(q: np.ndarray) -> np.ndarray:
+    """Let a joint stand 0.9 mrad to the side from which it comes, mostly from its middle."""
+    return q + 0.9e-3 * np.sign(q + 0.7 * np.random.default_rng(3).normal(size=q.shape))
+
+
 def loose_reflector(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
     """Let the reflector slip in its nest by 1 mm across the flange's axis, to whichever side is down."""
     (block,) = problem.data.blocks
@@ -367,8 +372,18 @@ def loose_reflector(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
         (values(lambda y: np.hstack([(2e3 * y[:, :1]).round() / 2e3, y[:, 1:]])), r"are rounded to 0.5 mm \(x\)"),
         (of_joint(4, tenths), r"are rounded to 0.1 deg \(q5\)"),
         (of_joint(2, lambda q: q + 0.009 * (q > 0.6)), r"from q3 = 3\d(\.\d+)? deg on .* a changed zero of joint 3"),
+        (of_joint(1, approached), r"backlash, joint 2 by 1\.\d mrad"),
+        (of_joint(4, lambda q: 50 * q), r"joint 5 is -[\d,.]+ to [\d,.]+ deg, but its limits are -360 to 360 deg"),
     ],
-    ids=["noise in a column", "a loose nest", "a rounded column", "a rounded joint", "a joint that falls back"],
+    ids=[
+        "noise in a column",
+        "a loose nest",
+        "a rounded column",
+        "a rounded joint",
+        "a joint that falls back",
+        "backlash by the angle",
+        "another unit of a joint",
+    ],
 )
 def test_what_a_learned_noise_or_gears_would_take_up_is_named(wrong, said: str) -> None:
     """Each was calibrated into a robot that is 1.5 to 25 times worse than from clean data, and delivered."""

@@ -172,6 +172,16 @@ def test_the_order_of_a_quaternion_is_checked_and_said(monkeypatch, capsys, tmp_
     assert "the quaternion's order is" not in capsys.readouterr().out
 
 
+def test_a_stated_order_of_a_quaternion_goes_before_the_names_of_its_columns(
+    monkeypatch, capsys, tmp_path, arm
+) -> None:
+    """A program wrote x, y, z, w below the names qw, qx, qy, qz."""
+    path = tmp_path / "poses.csv"
+    path.write_text(text([[*HEAD, "qw", "qx", "qy", "qz"]], beside(ROWS, cells(WXYZ[:, [1, 2, 3, 0]]))))
+    assert new(monkeypatch, arm, tmp_path / "cell", path, "--quaternion", "xyzw") == 0, capsys.readouterr().err
+    assert np.abs(ro.load(tmp_path / "cell").problem.data.blocks[0].y[:, 3:] - WXYZ).max() < 1e-5
+
+
 U = ["Point", *HEAD[1:7], "X", "Y", "Z"]
 REFUSED = {
     "no header": (text([], ROWS), [], ["line 1", "no header above 'P1", "--columns with 10 names"]),

@@ -152,10 +152,13 @@ ROUNDED = 1e-6  # the last row of a matrix is 0 0 0 1 within this
 
 
 def numbered(read: Meanings, table: Columns, dof: int, order: str) -> None:
-    """Name the numbered columns of quaternions and matrices."""
-    if order not in ORDERS:
+    """Name the numbered columns of quaternions and matrices; if an order is stated, others of a quaternion, too."""
+    if order not in ("", *ORDERS):
         raise InputError("--quaternion", f"'{order}'", " or ".join(ORDERS))
-    for i, (name, letter) in enumerate(zip(quaternion_columns(read, dof), order, strict=False), start=1):
+    columns = quaternion_columns(read, dof)
+    if order and not columns:
+        columns = [name for name, each in read.items() if each.stem in ("qw", "qx", "qy", "qz")]
+    for i, (name, letter) in enumerate(zip(columns, order or "wxyz", strict=False), start=1):
         read[name] = read[name]._replace(stem=f"q{letter}", why=f"component {i} of a quaternion, order {order}")
     stems = {reading.stem for reading in read.values()}
     if {"qx", "qy", "qz"} <= stems and "qw" not in stems:

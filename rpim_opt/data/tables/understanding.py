@@ -170,7 +170,7 @@ def _readings(
             break
     if stems & {"elevation", "zenith"}:
         _rename(read, {"d": "distance"}, "beside two angles")
-    numbered(read, table, dof, options.quaternion or "wxyz")
+    numbered(read, table, dof, options.quaternion)
     _put_in_robots_order(read, table, dof, joints)
     _count_from_one(read, dof)
     for stems in ({f"q{i}" for i in range(1, dof + 1)}, COORDINATES):
