@@ -130,7 +130,7 @@ def beyond_limits(robot: Robot, q: Array, by: float = 0.0) -> Iterator[str]:
     for i, dimension in enumerate(robot.joint_dimensions):
         low, high = robot.limits[i]
         least, largest = q[:, i].min(), q[:, i].max()
-        if max(low - least, largest - high) > max(by * (high - low), 1e-9):
+        if np.isfinite(high - low) and max(low - least, largest - high) > max(by * (high - low), 1e-9):
             unit, si = display(dimension)
             measured, limits = (f"{a / si:,.6g} to {b / si:,.6g} {unit}" for a, b in ((least, largest), (low, high)))
             yield f"joint {robot.joint(i)} is {measured}, but its limits are {limits}"
