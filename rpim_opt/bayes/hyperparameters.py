@@ -285,7 +285,8 @@ def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:
 def require_finite(*arrays: Array) -> None:
     """Refuse non-finite residuals or derivatives."""
     if not all(np.isfinite(values).all() for values in arrays):
-        raise InputError("data", "non-finite residuals or derivatives", "finite measurements and a finite model")
+        accepted = "finite measurements, and a finite model, of CasADi's functions (ca.sin, not math.sin)"
+        raise InputError("data", "non-finite residuals or derivatives", accepted)
 
 
 def _distance(x: Array, before: Array, laid: CalibrationProblem) -> float:

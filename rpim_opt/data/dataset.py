@@ -305,7 +305,8 @@ class Dataset(Tabled):
         else:
             blocks = (whole,)
         configuration = _numbered(map(tuple, q.reshape(N, -1).tolist()))
-        return cls(blocks, label or tuple(str(i + 1) for i in range(N)), configuration)
+        labels = _names(label, "label", N)
+        return cls(blocks, tuple(str(i + 1) for i in range(N)) if labels is None else tuple(labels), configuration)
 
     @classmethod
     def together(cls, parts: Sequence[Dataset], names: Sequence[str]) -> Dataset:

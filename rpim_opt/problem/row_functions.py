@@ -155,7 +155,9 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
             raise InputError(where, f"data without '{name}', on which it depends", "data that state it in every row")
         own[name] = known[name]
     modelled = ca.densify(measurement.model(*transforms, **own))
-    residual = ca.densify(measurement.minus(y if measurement.columns else 0, modelled))
+    residual = modelled
+    if modelled.numel() == len(measurement.columns) or measurement.components != measurement.columns:
+        residual = ca.densify(measurement.minus(y if measurement.columns else 0, modelled))
     if residual.numel() != len(measurement.components):
         found = f"{residual.numel()} components of the residual"
         raise InputError(f"measurement {measurement.name}", found, f"{len(measurement.components)} as it declares")

@@ -21,6 +21,11 @@ def read(tmp_path: Path, text: str, noise: dict[str, float] | None = None) -> ro
     return ro.read_data(path, ARM2, NOISE if noise is None else noise)
 
 
+def test_labels_are_one_per_row() -> None:
+    with pytest.raises(ro.InputError, match="label: found 1 names, accepted: 2, one per row"):
+        ro.Dataset.of(np.zeros((2, 6)), np.zeros((2, 3)), 1e-4, label=("a",))
+
+
 def test_units_of_the_header_are_converted(tmp_path: Path) -> None:
     mixed = read(tmp_path, "q1_mrad,q2_mm,x_m,y_mm,z_um\n500,20,1,2,3\n")
     assert mixed.q[0] == pytest.approx([0.5, 0.02])

@@ -161,3 +161,7 @@ def test_a_wrong_number_of_components_is_named() -> None:
     wrong = ro.data.Measurement("height", lambda T: ca.vertcat(T[2, 3], 1), COLUMNS, components=COLUMNS)
     with pytest.raises(ro.InputError, match="height: found 2 components of the residual, accepted: 1"):
         heights(wrong).residual(np.zeros(2))
+    pair = ro.data.Measurement("pair", lambda T: T[2, 3], {"a": "length", "b": "length"})
+    two = ro.Dataset.of(np.zeros((3, 6)), np.zeros((3, 2)), 1e-4, measurement=pair)
+    with pytest.raises(ro.InputError, match="pair: found 1 components of the residual, accepted: 2"):
+        ro.load("position").problem.on(two).residual(np.zeros(34))
