@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -142,7 +142,7 @@ class Prior:
         return cls(centre=centre, scale=width, optional=tuple(centre))
 
     def where_known(self, stated: Parameters, found: Parameters) -> Parameters:
-        """Return the table that was found, with what `known` combinations name where it is stated.
+        """Return the table that was found, with frames of known values there, and all that is known where it is stated.
 
         Of an orientation, and of frames with a scale of their own that is no wider than that of the table, too.
         """
@@ -150,8 +150,11 @@ class Prior:
         known = {name for each in self.statements if not each.whole for name in each.names}
         known |= set(np.array(stated.names)[stated.placed & (own <= stated.scale)].tolist())
         known |= {name[:-1] + axis for name in known for axis in "xyz" if name[:-1].endswith("_r")}
-        kept = np.isin(stated.names, list(known))
-        return replace(found, nominal=np.where(kept, stated.nominal, found.nominal))
+        nominal = np.where(np.isin(stated.names, list(known)), stated.nominal, found.nominal)
+        for each in (each for each in self.statements if each.reference is not None and len(each.names) == 1):
+            place = stated.placed & np.isin(stated.names, each.names) & (not each.whole)
+            nominal[place] = each.values[0] / each.rows[0][0]
+        return replace(found, nominal=nominal)
 
     def without_optional(self) -> Prior:
         """Return the prior without what is optional."""
@@ -165,10 +168,9 @@ class Prior:
         """Return both together; InputError where they contradict each other on a key."""
         if not isinstance(other, Prior):
             return NotImplemented
-        plain = Prior()
         both: dict[str, Any] = {}
-        for key in (each.name for each in fields(self)):
-            mine, theirs, default = getattr(self, key), getattr(other, key), getattr(plain, key)
+        for key, default in vars(Prior()).items():
+            mine, theirs = getattr(self, key), getattr(other, key)
             if key == "statements":
                 both[key] = mine + theirs
             elif isinstance(mine, dict):
@@ -218,8 +220,6 @@ class Prior:
             names=names,
             tails=self.tails,
         )
-
-    # --- groups and tails where nothing is stated ----------------------------------------------------------------
 
     def _grouped(self, parameters: Parameters, known: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return every identified parameter's group by number, and the names; some scales (P,) are known."""

@@ -131,7 +131,7 @@ class Record:
     they were used, None where validation data are still unused; ``earlier`` the calibrations that this one carries on
     (`use.update`), the last one last; ``digest`` that of the file that it was read from. Later tables are read as
     ``reading`` states (`TableOptions.stated`); ``terms`` are those of a Python file in the problem's folder,
-    ``mine:droop``.
+    ``mine:droop``; ``known`` what its prior states of parameters.
 
     >>> import rpim_opt as ro
     >>> record = ro.data.Record("Cell 7", source="Tracker campaign of May", excluded={"P17": "reflector bumped"})
@@ -155,6 +155,7 @@ class Record:
     digest: str = ""
     reading: Mapping[str, str] = field(default_factory=dict)
     terms: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
 
     @property
     def identity(self) -> str:

@@ -18,6 +18,7 @@ from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import joint_columns, printed
+from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
@@ -300,6 +301,12 @@ def _parameters(content: Content) -> Iterator[Block]:
             title, caption = f"Deviations of the {dimension} parameters", f"The robot's {dimension} parameters."
             drawn.append(figure(draw, title, caption, 80.0 + 17 * count[dimension]))
     yield "beside", [("table", Table("Identified parameters", head[:columns], rows)), ("figures", drawn)]
+    known = []
+    for text in result.record.known:
+        of, values, _ = Prior.known(text).statements[0].on(result.problem.parameters)
+        known += [[text, f"{off:+.2f}"] for off in of @ result.z - values]
+    if known:
+        yield "table", Table("Known values", ["stated", "identified minus stated, in standard deviations"], known)
     curves = transmission_errors(result)
     if not curves:
         return

@@ -137,6 +137,7 @@ def load(
             problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
         formulation = _formulation(definition, problem)
         prior = problem_file.stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
+        problem = problem.with_parameters(prior.where_known(problem.parameters, problem.parameters))
         if definition.base is None:
             _require_values_of_base(prior)
         details = problem_file.stated_details(table.record)
@@ -164,6 +165,7 @@ def load(
         requirement=requirement,
         reading=table.reading,
         terms=tuple(table.terms) if model is None else (),
+        known=tuple(table.prior.known),
     )
     return Instance(
         problem,
@@ -182,8 +184,7 @@ def load(
 
 def _require_values_of_base(prior: Prior) -> None:
     """Refuse known parameters of a base without a value, where the problem states no base."""
-    nominal = [name for each in prior.statements if each.reference is None for name in each.names]
-    for name in nominal:
+    for name in (name for each in prior.statements if each.reference is None for name in each.names):
         if name.startswith("base_"):
             found = f"'{name}' without a value, where base = \"auto\""
             raise InputError("key prior.known", found, f"'{name} = ... +- ...', or a table [base]")

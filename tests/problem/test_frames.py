@@ -16,6 +16,7 @@ from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem.registration.closed_forms import register
 from rpim_opt.problem.registration.frames import locate
 from rpim_opt.robot.kinematics import numeric_frame
+from tests.calibration.mistakes import simulated_arm
 from tests.simulate import ARM, simulated
 
 
@@ -103,6 +104,25 @@ def test_a_known_base_is_not_registered_again_where_a_joint_zero_is_off(known: s
     assert result.converged
     assert abs(values["base_rz"]) < 4 * 0.5e-3
     assert values["theta1"] - ARM.mdh[0, 2] == pytest.approx(0.8, abs=0.004)
+
+
+def test_deviations_of_frames_count_from_their_known_values() -> None:
+    """Of a turned base too, whose deviations are rotations about the axes of its parent."""
+    problem = simulated_arm("ur5e", count=25)
+    found = ro.calibrate(problem)
+    values = found.problem.parameters.by_name(found.x)
+    places = {"tool_y": ("mm", 1e-3, 0.05), "base_rx": ("mrad", 1e-3, 0.01), "base_ry": ("mrad", 1e-3, 0.01)}
+    known = ro.bayes.Prior()
+    for name, (unit, si, sigma) in places.items():
+        known &= ro.bayes.Prior.known(f"{name} = {values[name] / si + sigma:.4f} +- {sigma} {unit}")
+    result = ro.calibrate(problem, prior=known)
+    assert result.verdict.delivered
+    rows = {row["parameter"]: row for row in result.parameter_rows()}
+    for name, (_, si, sigma) in places.items():
+        p = result.problem.parameters
+        assert p.nominal[p.names.index(name)] == pytest.approx(values[name] + sigma * si, abs=1e-7)
+        assert abs(result.x[p.free.names.index(name)]) < 2 * sigma * si
+        assert rows[name]["identified"] == pytest.approx(rows[name]["nominal"], abs=0.11)
 
 
 def test_a_base_nobody_knows_is_registered() -> None:

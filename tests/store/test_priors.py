@@ -106,6 +106,20 @@ theta5_mrad = 4.0
     assert with_prior(folder, text).prior == wanted
 
 
+def test_a_report_lists_known_values_with_their_normalized_deviations(folder: Path) -> None:
+    texts = ("a2 + a3 = nominal + 0.1 +- 0.05 mm", "tool_z = 61 +- 2 mm")
+    result = with_prior(folder, f"[prior]\nknown = {list(texts)}".replace("'", '"')).calibrate()
+    ro.store.save_result(result, folder / "result.json")
+    ro.report.write_report(ro.load_result(folder / "result.json"), folder / "report.html")
+    page = (folder / "report.html").read_text(encoding="utf-8")
+    values, nominal = result.problem.parameters.by_name(result.x), result.problem.parameters
+    assert nominal.nominal[nominal.names.index("tool_z")] == pytest.approx(0.061)
+    deviation = dict(zip(nominal.free.names, result.x, strict=True))
+    off = ((deviation["a2"] + deviation["a3"] - 1e-4) / 5e-5, (values["tool_z"] - 0.061) / 2e-3)
+    for text, size in zip(texts, off, strict=True):
+        assert f">{text}</th><td>{size:+.2f}</td>" in page
+
+
 @pytest.mark.parametrize(
     ("scale", "first"), [("", 3.0), ("joint_offset_mrad = 10.0", 1.0), ('"theta?_mrad" = 5.0', 1.0)]
 )
