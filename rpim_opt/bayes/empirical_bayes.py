@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import listed
+from rpim_opt.basics.text import joined, listed
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Estimator, ExcludedRow, Fit, Learned, Trial, learned, sampled
 from rpim_opt.bayes.model_selection import select_model
@@ -20,13 +21,13 @@ from rpim_opt.bayes.transmission import admitted
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import ridge_deviations
+from rpim_opt.robot.parameters import own_name
 
 ROUNDS = 6  # linearizations at which hyperparameters are estimated
 REQUIRED_GAIN = 6.0
 """By how much -2 ln L must fall for an optional prior: a likelihood ratio of twenty, which by Markov's inequality one
 arm of another kind in twenty shows at most."""
-CONTRADICTED = 28.0
-"""By how much -2 ln L must fall without a known value that the data contradict: in the same way once in a million."""
+CONTRADICTED = 1e-7  # probability with which right known values are so far from the data
 OUTLIER_SEARCHES = 4  # how often outliers are looked for again without those that were found: they mask each other
 
 
@@ -73,9 +74,7 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
             estimator, whole = plain, without
             reason = f"its likelihood-ratio statistic is {fall:.1f}; {REQUIRED_GAIN:g} is required."
             notes = (f"The population prior is not used: {reason}",)
-    contradicted = tuple(_contradicted(every, estimator, whole, start))
     (fit, trials, gain), outliers = _without_outliers(every, estimator, whole, model)
-    requested = p.free.names
     if gain > 0:
         problem = problem.with_transmission(fit.problem.robot.model.curves)
     laid = problem.with_parameters(fit.laid.parameters).with_repeatability(fit.laid.repeatability)
@@ -84,8 +83,8 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
     left_out: list[ExcludedRow] = []
     if outliers:
         errors = dict(zip(laid.labels, largest_errors(laid, fit.x), strict=True))
-        for label, ratio in sorted(outliers.items(), key=lambda item: -item[1]):
-            left_out.append(ExcludedRow(label, ratio, *errors[label]))
+        worst_first = sorted(outliers.items(), key=lambda item: -item[1])
+        left_out = [ExcludedRow(label, ratio, *errors[label]) for label, ratio in worst_first]
         if keep:
             kept = listed([str(row) for row in left_out], 5)
             notes += (f"Outliers, kept because the loss depends on the order of its equations: {kept}.",)
@@ -97,37 +96,57 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
         gain,
         trials=trials,
         left_out=tuple(left_out),
-        added=tuple(name for name in fit.problem.parameters.free.names if name not in requested),
-        contradicted=contradicted,
+        added=tuple(name for name in fit.problem.parameters.free.names if name not in p.free.names),
+        contradicted=tuple(_contradicted(fit)),
     )
     return Estimated(laid, replace(hyperparameters, notes=(*notes, *hyperparameters.notes)), fit.inside, fit.x)
 
 
-def _contradicted(every: CalibrationProblem, estimator: Estimator, whole: Fit, start: Array) -> Iterator[str]:
-    """Say which known values are off: by how much -2 ln of the data's likelihood p(y | value) falls without one.
+def _contradicted(fit: Fit) -> Iterator[str]:
+    """Say which known values are off: single ones, or several of one kind of frame that are unlikely together.
 
-    A fit with the statement r z = v +- 1 knows p(y, value). With prior means m and variances V of a fit without it::
+    With mean z and covariance C of a fit without the statements R z = v +- 1, but with their local variances, as a
+    joint zero far off is no reason against a frame, chi-squared falls most without those that are off::
 
-        -2 ln p(value) = ln s + (v - r m)^2 / s,    s = 1 + r V r'
+        chi-squared = d' S^-1 d,    d = R z - v,    S = 1 + R C R'
     """
-    prior, free = estimator.prior, every.parameters.free
-    for statement in prior.statements:
-        rows, values, _ = statement.on(every.parameters)
-        if statement.whole or not len(rows):  # an earlier result; of parameters that are not identified
-            continue
-        others = tuple(each for each in prior.statements if each is not statement)
-        without = replace(estimator, prior=replace(prior, statements=others)).fit(every, start, None, ROUNDS)
-        spread = 1 + float((rows[0] * without.stated.scale) ** 2 @ without.point.v)
-        centre = float(values[0] - rows[0] @ without.stated.centre)
-        fall = whole.point.value - without.point.value - np.log(spread) - centre**2 / spread
-        if fall > CONTRADICTED:
-            own = rows[0] / free.scale
-            unit, si = display(free.dimensions[int(np.argmax(np.abs(own)))])
-            off = float(values[0] - own @ without.x) / np.abs(own).max() / si
-            yield (
-                f"The data contradict {statement.where}, by {off:+.3g} {unit} (likelihood-ratio statistic {fall:.0f}). "
-                "Correct it, or take it out of the prior."
-            )
+    prior, p = fit.estimator.prior, fit.problem.parameters
+    known = [each for each in prior.statements if not each.whole and len(each.on(p)[1])]
+    if not known:
+        return
+    bare = replace(prior, statements=tuple(each for each in prior.statements if each.whole))
+    without = replace(fit.estimator, prior=bare).fit(fit.problem, fit.x, None, ROUNDS)
+    stated, z = without.stated, without.point.z
+    opened = np.where(stated.replaced, 0.0, 1 / fit.point.v - 1 / without.point.v)
+    C = np.linalg.inv(np.linalg.inv(without.point.C) + np.diag(opened))
+    R, values = (np.concatenate([each.on(p)[k] for each in known]) for k in range(2))
+    d = R @ (stated.centre + stated.scale * (z - C @ (opened * z))) - values
+    S = np.eye(len(R)) + R * stated.scale @ C @ (R * stated.scale).T
+    while known:
+        groups: dict[object, list[int]] = {}
+        for i, each in enumerate(known):
+            kind, _, coordinate = own_name(each.names[0]).partition("_")
+            for key in (i, kind, (kind, coordinate.rpartition("_")[2])):
+                groups.setdefault(key, []).append(i)
+        P = np.linalg.inv(S)
+        off = {key: np.linalg.solve(P[np.ix_(g, g)], P[g] @ d) for key, g in groups.items()}
+        chi2 = {key: float(d @ P[:, g] @ off[key]) for key, g in groups.items()}
+        beyond = [key for key, g in groups.items() if chi2[key] > chdtri(len(g), CONTRADICTED)]
+        if not beyond:
+            return
+        worst = max(beyond, key=lambda key: chi2[key] / len(groups[key]))
+        sizes = []
+        for i, size in zip(groups[worst], off[worst], strict=True):
+            factors = np.abs(known[i].rows[0])
+            unit, si = display(known[i].dimensions[int(factors.argmax())])
+            sizes.append(f"{size / factors.max() / si:+.3g} {unit}")
+        named = joined([f"'{known[i].text}'" for i in groups[worst]])
+        yield (
+            f"The data contradict prior {named}, by {joined(sizes)} (chi-squared {chi2[worst]:.0f} of {len(sizes)}). "
+            "Correct what is stated, or take it out of the prior."
+        )
+        left = np.setdiff1d(np.arange(len(known)), groups[worst])
+        known, R, d, S = [known[i] for i in left], R[left], d[left], S[np.ix_(left, left)]
 
 
 class _Explained(NamedTuple):
@@ -146,9 +165,8 @@ def _without_outliers(
     def explain(outliers: Mapping[str, float], last: _Explained) -> _Explained:
         fit = whole
         if last.gain > 0:  # curves that were admitted beside other outliers stay
-            estimated = replace(estimator, curves=last.fit.problem.robot.model.curves, refit=None)
             rows = last.fit.problem.on(every.data).without(outliers)
-            return last._replace(fit=estimated.fit(rows, last.fit.x, last.fit.point.logs, ROUNDS))
+            return last._replace(fit=last.fit.estimator.fit(rows, last.fit.x, last.fit.point.logs, ROUNDS))
         if outliers:
             fit = estimator.fit(whole.problem.without(outliers), whole.x, None, ROUNDS)
         if model == "geometry":
@@ -181,8 +199,7 @@ def _without_outliers(
 def with_extensions(problem: Source, found: Estimated) -> Source:
     """Return the problem with the selected model extensions, otherwise unchanged."""
     if found.learned.curves is not None:
-        robots = {name: robot.model.curves for name, robot in found.problem.arms.items()}
-        problem = problem.with_transmission(robots[""])
+        problem = problem.with_transmission(found.problem.arms[""].model.curves)
     p = problem.parameters
     added = np.isin(p.names, found.learned.added)
     scale = np.where(added, found.problem.parameters.scale, p.scale)

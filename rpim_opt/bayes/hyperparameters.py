@@ -11,16 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Brief, joined
-from rpim_opt.bayes.evidence import (
-    FARTHEST,
-    Evidence,
-    Hierarchy,
-    Linearized,
-    Point,
-    Spectrum,
-    tail_widening,
-    widening,
-)
+from rpim_opt.bayes.evidence import FARTHEST, Evidence, Hierarchy, Linearized, Point, Spectrum, tail_widening, widening
 from rpim_opt.bayes.prior import SESSIONS, Prior
 from rpim_opt.bayes.prior_terms import ScaledPrior
 from rpim_opt.convex.formulation import Formulation, tikhonov
@@ -145,7 +136,7 @@ class Fit:
 
     ``problem`` has its stated scales and the prior ``stated``; ``evidence`` is the last marginal likelihood, ``point``
     its optimum, ``others`` those that were reached from other sides. ``laid`` is the problem with local scales and
-    noise, ordinary Tikhonov at weight 1, and ``x`` (n,) its solution [SI].
+    noise, ordinary Tikhonov at weight 1, and ``x`` (n,) its solution [SI], by this ``estimator``.
     """
 
     problem: CalibrationProblem
@@ -155,6 +146,7 @@ class Fit:
     others: Sequence[Point]
     laid: CalibrationProblem
     x: Array
+    estimator: Estimator
 
     @property
     def spare(self) -> float:
@@ -249,7 +241,7 @@ class Estimator:
         repeatability = replace(evidence.repeatability(point.logs), at=p.values_at(x))
         laid = replace(problem, parameters=replace(p, scale=scale), repeatability=repeatability)
         mean = p.free.scale * (prior.centre + prior.scale * point.z)
-        fit = Fit(problem, prior, evidence, point, others, laid, mean)
+        fit = Fit(problem, prior, evidence, point, others, laid, mean, self)
         if self.refit is None or _distance(mean, x, laid) <= CLOSE:  # near enough for one linearization
             return fit
         return replace(fit, x=self.refit(laid, fit.inside.penalized(tikhonov), x, ITERATIONS * 2**k))

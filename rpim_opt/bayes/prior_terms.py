@@ -194,11 +194,10 @@ class Statement:
         missing = [name for name in self.names if name not in here]
         if missing and (not self.whole or len(missing) == len(self.names)):
             raise InputError(self.where, f"'{missing[0]}'", "parameters: " + choices(missing[0], parameters.names))
-        of = {name: parameters.dimensions[here[name]] for name in self.names if name in here}
-        for name, dimension in zip(self.names, self.dimensions, strict=True):
-            if name in of and dimension != of[name]:
-                raise InputError(self.where, f"a unit of {dimension} for '{name}'", f"one of {of[name]}")
         known = [name for name in self.names if name in here]
+        for name, dimension in zip(self.names, self.dimensions, strict=True):
+            if name in here and dimension != (of := parameters.dimensions[here[name]]):
+                raise InputError(self.where, f"a unit of {dimension} for '{name}'", f"one of {of}")
         place = np.array([here[name] for name in known], dtype=int)
         own = np.array([self.names.index(name) for name in known], dtype=int)
         offset = np.zeros(len(place))  # by how much nominal values [SI] differ from the reference
@@ -235,8 +234,7 @@ class Statement:
         rows = np.array(self.rows)[:, own]
         apart = np.abs(np.array(self.values) - rows @ offset)
         if (apart > FAR * (1 + np.linalg.norm(rows * parameters.scale[place], axis=1))).any():
-            norms = np.linalg.norm(rows, axis=1)
-            size = float(np.max(apart / np.where(norms > 0, norms, 1.0)))
+            size = float(np.max(apart / np.linalg.norm(rows, axis=1)))
             unit, si = display(parameters.dimensions[place[0]])
             found = f"a value {size / si:.4g} {unit} off nominal"
             raise InputError(self.where, found, "a value near nominal; '= nominal +- ...' refers to the nominal value")

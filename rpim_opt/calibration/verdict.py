@@ -470,8 +470,7 @@ def likely_causes(result: Outcome) -> list[str]:
     if result.mapping is not None:
         shared += result.mapping.ambiguities
     if known:
-        first_of = ["Correct the one with the largest statistic first: the others may be right."] * (len(known) > 1)
-        causes, shared = [], [*known, *first_of, *shared]
+        causes, shared = [], [*known, *shared]
     elif signs or not result.converged:
         causes = _held(result, problem) or _limited_by_formulation(result, problem, kept)
         causes = causes or [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]

@@ -290,9 +290,5 @@ def ridge_within(model: LinearModel, penalty: Quadratic | None, moves: Array, z:
         Quadratic(form.matrix @ moves, form.c - form.matrix @ z),
     )
     return replace(
-        inside,
-        B=moves @ inside.B,
-        offset=z + moves @ inside.offset,
-        free=moves @ inside.free,
-        null=moves @ inside.null,
+        inside, B=moves @ inside.B, offset=z + moves @ inside.offset, free=moves @ inside.free, null=moves @ inside.null
     )

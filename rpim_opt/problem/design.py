@@ -90,11 +90,7 @@ def joint_cells(robot: Robot, q: Array, index: np.ndarray) -> dict[str, list[str
 
 
 def choose(
-    problem: CalibrationProblem,
-    candidates: Array,
-    count: int,
-    criterion: str = "V",
-    measured: Dataset | None = None,
+    problem: CalibrationProblem, candidates: Array, count: int, criterion: str = "V", measured: Dataset | None = None
 ) -> Design:
     """Choose the configurations that are most informative about the identified parameters.
 

@@ -27,13 +27,7 @@ from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import register, transformed
-from rpim_opt.problem.row_functions import (
-    Loads,
-    loads_on,
-    measured_torques,
-    require_known_masses,
-    require_same_torques,
-)
+from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_known_masses, require_same_torques
 from rpim_opt.robot import kinematics
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, call_rows, chain, forward_kinematics, numeric_frame, product

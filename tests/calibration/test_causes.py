@@ -832,7 +832,7 @@ def test_what_is_not_identified_and_wrong_is_named(off: dict[str, float], said: 
 
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("model", ["geometry", "auto"])
-@pytest.mark.parametrize(("value", "off"), [("a2 = nominal + 5", "+5.24"), ("d5 = nominal + 2", "+1.34")])
+@pytest.mark.parametrize(("value", "off"), [("a2 = nominal + 5", "-5.24"), ("d5 = nominal + 2", "-1.33")])
 def test_a_known_value_that_is_wrong_is_named_first(monkeypatch, capsys, tmp_path, model, value, off) -> None:
     """Gravity, backlash or the weight would be named for it; a right one is not named."""
     made(monkeypatch, tmp_path, simulated_arm("ur5e", count=60))
