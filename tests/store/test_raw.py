@@ -422,6 +422,28 @@ def test_joined_readings_keep_the_names_of_their_points(monkeypatch, capsys, tmp
     assert set(labels) == {f"{name[0]}/{marker}" for name in NAMED for marker in ("A", "B")}
 
 
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_group_for_every_configuration_has_points_that_are_reflectors(
+    monkeypatch, capsys, tmp_path, arm, whole
+) -> None:
+    """As SpatialAnalyzer exports them, beside joints or with them; one shot is missing."""
+    rows = [
+        [*name, mark, *axes, *point] for name, axes, point in zip(NAMED, JOINTS, POINTS, strict=True) for mark in "AB"
+    ]
+    joints, points = tmp_path / "joints.csv", tmp_path / "points.csv"
+    joints.write_text(text([["Pose", *HEAD[1:7]]], beside(NAMED, JOINTS)))
+    points.write_text(text([["Gruppe", "Punkt", *HEAD[7:]]], [[*row[:2], *row[8:]] for row in rows[:-1]]))
+    files = [joints, points]
+    if whole:
+        points.write_text(text([["Gruppe", "Punkt", *HEAD[1:]]], rows[:-1]))
+        files = [points]
+    assert new(monkeypatch, arm, tmp_path / "cell", files) == 0, capsys.readouterr().err
+    data = ro.load(tmp_path / "cell").problem.data
+    assert len(data) == 2 * COUNT - 1
+    assert {block.markers for block in data.blocks} == {("A",), ("B",)}
+    assert len(np.unique(data.configuration)) == COUNT
+
+
 def test_every_reflector_is_joined_by_the_nearest_time(monkeypatch, capsys, tmp_path, arm) -> None:
     joints, points = clocked(tmp_path, rate=10.0, apart=0.0)
     rows = []

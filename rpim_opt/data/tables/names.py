@@ -60,7 +60,7 @@ NAMES: tuple[tuple[str, ...], ...] = (
     (r"(?:slope_?|slant_?)?(?:distance|dist|range)|sd|(?:cable|wire|rope)(?:_length)?", "distance"),
     (r"label|name|id|no|nr|number|index|row|point(?:_(?:id|name|no|nr))?|target(?:_(?:id|name))?|messpunkt|feature"
          r"|punkt(?:_?(?:name|nr))?|pos(?:e|ition)?_?name|nom_du_point|punto|pt|点名|点号|測定点|測点"
-         r"|(?:collection_)?group", "label"),
+         r"|(?:collection_)?group|gruppe", "label"),
     (r"configuration|config|pose|pose_id", "configuration"),
     (r"marker|(?:reflector|reflektor|smr|prism)(?:_(?:id|name|no|nr))?", "marker"),
     (r"anchor(?:_(?:id|name|no|nr))?", "fixture"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -200,6 +201,13 @@ def counts_rows(keys: Sequence[str]) -> bool:
 def _choose_label(read: Meanings, table: Columns, key: str) -> None:
     """Of several labels keep the stated key, or the one that distinguishes rows and is no row number."""
     cells = {name: [str(cell).strip() for cell in table[name]] for name, each in read.items() if each.stem == "label"}
+    for group, point in permutations(cells, 2):  # SpatialAnalyzer's, a group for every configuration
+        rows = [*zip(cells[group], cells[point], strict=True)]
+        repeated = len(rows) > len(set(cells[group])) > len(set(cells[point])) > 1
+        if re.search("group|gruppe", group.lower()) and repeated and len(set(rows)) == len(rows):
+            read[group] = read[group]._replace(stem="configuration")
+            read[point] = Meaning("marker", "", f"the same in every '{group}'")
+            return
     chosen = [name for name in cells if name.lower() == key.lower()]
     if not chosen:
         counting = [name for name in cells if not counts_rows(cells[name])]
