@@ -225,10 +225,8 @@ class State:
 
     @property
     def far(self) -> bool:
-        """Whether some deviation exceeds `FAR` prior standard deviations: its scale, or more by a weaker penalty."""
-        form = self.program.penalty_form
-        precise = np.ones(1) if form is None else np.linalg.norm(form.matrix, axis=0)
-        return float((np.abs(self.z) * np.where(precise > 0, np.minimum(precise, 1.0), 1.0)).max(initial=0.0)) > FAR
+        """Whether some deviation exceeds `FAR` prior standard deviations."""
+        return float(np.abs(self.z).max(initial=0.0)) > FAR
 
     def relative(self, length: float) -> float:
         """Return a length relative to that of the solution."""

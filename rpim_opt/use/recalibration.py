@@ -257,7 +257,11 @@ def update(
     matches = matching(free, reset, "update, reset") if reset else np.zeros(len(free), dtype=bool)
     released = tuple(np.array(free.names)[matches].tolist())
     say("comparing with the previous calibration")
-    problem, start, released, elsewhere = _registered_again(result, problem, released, prior_inflation)
+    elsewhere = "" if released else _base_elsewhere(result, problem, prior_inflation)
+    if elsewhere:
+        released = tuple(name for name in free.names if name.startswith(registration(free, data)))
+    # a frame that was reset may be anywhere: then it is registered again
+    start = None if released else previous_deviations(result, problem)
     changes: list[Cause] = []
     first: tuple[tuple[Cause, ...], Fit] | None = None  # before anything is released
     while True:
@@ -285,6 +289,14 @@ def update(
             same = f"those of the same robot ({_robots(result)}) in the same units and instrument's frame"
             found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
             raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
+    vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
+    p, x = updated.problem.parameters, updated.x  # scales say how far a frame may be, and one that was reset is there
+    frames = np.isin(p.free.names, released) & p.free.of_frames
+    if (frames & (np.abs(x) > p.free.scale)).any():
+        scale = p.scale.copy()
+        scale[p.identified] = np.where(frames, np.maximum(p.free.scale, np.abs(x)), p.free.scale)
+        problem = problem.with_parameters(replace(p, scale=scale))
+        updated = _recalibrated(result, problem, released, prior_inflation, x)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     last = Earlier(
         result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],
@@ -296,7 +308,6 @@ def update(
     elsewhere = " ".join(filter(None, [elsewhere, said]))
     updated = replace(updated, record=_carried_on(result.record, last, source))
     moved = _moved(result, updated, released, changes)
-    vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
     return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
 
 
@@ -347,37 +358,23 @@ def _robots(result: Calibration) -> str:
     return " and ".join(robot.name for robot in result.problem.arms.values())
 
 
-def _registered_again(
-    result: Calibration, problem: CalibrationProblem, released: tuple[str, ...], inflation: float
-) -> tuple[CalibrationProblem, Array | None, tuple[str, ...], str]:
-    """Return the problem, its nominal base where readings put it, a start (n,) [SI] or None, and what is released.
-
-    And a sentence on where the base is and was, where readings that are displaced together put it out of its place.
-    """
-    # evidence is linear in the deviations, and scales are about the nominal base: of one that turned far, both are none
+def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation: float) -> str:
+    """Say where the base is and was, if readings that are displaced together put it out of its place; empty else."""
+    # evidence is linear in the deviations: of a base that turned far, it is none
     free, data = problem.parameters.free, problem.data
     place = registration(free, data)
-    base = tuple(name for name in free.names if name.startswith(place))
-    start = None if released else previous_deviations(result, problem)
-    if not released and not (base and displacement(result, data, held_out_errors(result, data))[0]):
-        return problem, start, released, ""
-    again = released or base
-    registered = _recalibrated(result, problem, again, inflation, None)
+    base = [name for name in free.names if name.startswith(place)]
+    if not base or not displacement(result, problem.data, held_out_errors(result, problem.data))[0]:
+        return ""
+    registered = _recalibrated(result, problem, base, inflation, None)
     session = "" if place == BASE else str(data.session[0])
     was, now = (np.array(frame_numbers(base_frame(each, "", session))) for each in (result, registered))
     if same_place(was, now):
-        return problem, start, released, ""
-    start = None
-    if place == BASE and {*base} <= {*again}:
-        p = registered.problem.parameters
-        nominal = np.where(np.isin(p.names, base), p.values_at(registered.x), p.nominal)
-        problem = problem.with_parameters(replace(p, nominal=nominal))
-        start = np.where(np.isin(free.names, base), 0.0, registered.x)
-    said = (
+        return ""
+    return (
         f"The instrument or the base moved: in the instrument's frame the base is at {placed(now)}, previously at "
         f"{placed(was)}. It was registered again, as with --reset '{place}*'."
     )
-    return problem, start, again, "" if released else said
 
 
 def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:

@@ -175,21 +175,19 @@ def test_an_instrument_that_was_set_up_anew(crashed: Robot) -> None:
     assert rms(found.result, robot.now) < 4 * SIGMA * 1e3
 
 
-def test_deviations_of_a_base_that_was_reset_are_from_where_it_is_now() -> None:
-    """From where it was they were a thousand scales: the lack of fit took them for misfit, in minutes, and warned."""
+def test_a_base_that_was_reset_is_within_its_scale() -> None:
+    """It was a thousand scales away: the lack of fit took it for misfit, for minutes, and the message warned."""
     robot = happened(8, base_x=5.0, base_y=-3.0, base_rz=1.5, theta4=0.02)
     first = ro.calibrate(robot.problem)
     found = ro.use.update(first, robot.after, reset=("base_*",))
     free = found.result.problem.parameters.free
     base = np.char.startswith(free.names, "base_")
-    assert (np.abs(found.result.x[base]) < 3 * free.scale[base]).all()
+    assert (np.abs(found.result.x[base]) <= 1.001 * free.scale[base]).all()
     assert "Deviations exceed" not in found.result.message
     assert rms(found.result, robot.now) < 4 * SIGMA * 1e3
     assert [cause.name for cause in found.changes] == ["theta4"]
     (theta4,) = (each for each in found.moved if each.name == "theta4")
     assert abs(theta4.change - 0.02) < 4 * theta4.std
-    part = ro.use.update(first, robot.after, reset=("base_x", "base_y"))
-    assert "Deviations exceed" not in part.result.message
 
 
 @pytest.mark.parametrize(("rows", "undetermined"), [(2, ("base",)), (3, ())])
