@@ -249,8 +249,8 @@ class Comparison(Models):
     @cached_property
     def best(self) -> Candidate:
         """The selected model, with a penalty of `SPEAK` per extension."""
-        learned = self.result.learned
-        if learned is not None and learned.trials:  # it was selected then
+        learned, updated = self.result.learned, self.result.record.earlier
+        if learned is not None and learned.trials and not updated:  # it was selected then, of an update by other rows
             return self.plain
         candidates = self.compared(lambda some: self._fitted(some, self.members(some)) if some else self.plain)
         return min([self.plain, *candidates], key=lambda each: each.criterion)

@@ -30,6 +30,10 @@ NEGLIGIBLE = 0.1  # parts below this share of a larger one are not worth a word
 RARE = 1e-3  # probability that residuals exceed the standard deviation of repeated readings by chance
 PERMUTATIONS = 300  # permutations that an autocorrelation is compared with
 FEWEST_NEIGHBOURS = 8  # configurations below which there is no autocorrelation
+TOGETHER = (
+    "An update keeps the model: calibrate all tables together (`rpim-opt new FOLDER --data OLD --data NEW ...`, then "
+    "`calibrate`)."
+)
 
 
 class Extension(NamedTuple):
@@ -87,7 +91,8 @@ class LackOfFit:
     ``autocorrelation`` is that of the residuals with all that is missing, None for too few; ``upward`` are joints
     whose compliance is significantly negative, which gravity cannot do. ``repeated`` is the RMS of repeated readings
     about their mean, None without enough, ``excess`` that of the residuals beyond, where it is more than chance.
-    ``overstated``: the residuals are smaller than the stated noise, by the chi-squared test (`NoiseTest`).
+    ``overstated``: the residuals are smaller than the stated noise, by the chi-squared test (`NoiseTest`);
+    ``updated``: an earlier calibration is the prior, whose model they were not compared for.
     """
 
     configurations: int
@@ -109,6 +114,7 @@ class LackOfFit:
     repeated: float | None = None
     excess: float = 0.0
     overstated: bool = False
+    updated: bool = False
 
     @property
     def robot(self) -> float:
@@ -141,9 +147,10 @@ class LackOfFit:
             lines.append(f"{EXTENSIONS[extension].effect} (likelihood-ratio statistic {gain:.0f}).")
         if self.missing:
             what = joined([EXTENSIONS[extension].name for extension in self.missing])
+            remedy = f': add {joined(self.parameters)} to `identify`, or model = "auto".'
             lines.append(
                 f"{what[0].upper()}{what[1:]} would explain {self.share:.0%} of the mean square residual (likelihood-"
-                f'ratio statistic {self.gain:.0f}): add {joined(self.parameters)} to `identify`, or model = "auto".'
+                f"ratio statistic {self.gain:.0f}){f'. {TOGETHER}' if self.updated else remedy}"
             )
         if self.upward:
             said = upward_sentence(self.upward)
@@ -168,7 +175,7 @@ class LackOfFit:
             size = document.pop(key)
             document[f"{key}_{unit}"] = None if size is None else size / si
         document["identify"] = list(document.pop("parameters"))
-        del document["overstated"]  # which a sentence says
+        del document["overstated"], document["updated"]  # which sentences say
         autocorrelation = self.autocorrelation and self.autocorrelation._asdict()
         return {**document, "autocorrelation": autocorrelation, "alarming": self.alarming, "text": self.sentences()}
 
@@ -223,6 +230,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
         repeated=again,
         excess=excess,
         overstated=not result.no_intervals and result.noise_test().overstated,
+        updated=bool(result.record.earlier),
     )
 
 
@@ -347,6 +355,8 @@ def _limit(found: LackOfFit) -> str:
         return (
             f"{even} of neighbouring configurations are correlated ({found.autocorrelation.correlation:.2f}, z = "
             f"{found.autocorrelation.z:.0f}): the model lacks an effect, which averaging more readings does not remove."
+            + f" {TOGETHER}"
+            * (found.updated and not found.missing)
         )
     if found.robot > GROSS * found.instrument:
         return "No robot has such poor repeatability: check units, signs, frames and rows first."

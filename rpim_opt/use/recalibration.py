@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,6 +19,7 @@ from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration.held_out import displacement, registered, registration
 from rpim_opt.calibration.identify import calibrate
+from rpim_opt.calibration.lack_of_fit import TOGETHER, judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors, transmission_errors
 from rpim_opt.calibration.verdict import refuse_misread
@@ -151,6 +152,12 @@ class Update:
         """Whether readings and the previous calibration agree, apart from the changes."""
         return self.after.likely
 
+    @cached_property
+    def lacking(self) -> str:
+        """A sentence on an effect that the model lacks by the new rows, and what to do; empty without one."""
+        fit = judged(self.result)
+        return " ".join(line for line in fit.sentences() if TOGETHER in line) if fit else ""
+
     def content(self) -> dict[str, Any]:
         """Return the figures [mm, deg], all causes, and the earlier calibrations."""
         return {
@@ -164,6 +171,7 @@ class Update:
             "readings": self.readings,
             "undetermined": self.undetermined,
             "errors": self.errors,
+            "lacking": self.lacking,
             "converged": self.result.converged,
             "verdict": self.result.verdict.content(),
             "earlier": [each._asdict() for each in self.result.record.earlier],
@@ -207,6 +215,7 @@ class Update:
             was, now = (f"{of[when]['rms_mm']:.4f} mm" for when in ("before", "after"))
             rows = counted(of["after"]["count"], f"{name} row")
             lines.append(f"RMS error on {rows}: {was} with the previous calibration, {now} with this one.")
+        lines += filter(None, [self.lacking])
         if not self.explained:
             lines.append(
                 "No small set of changed parameters, frames or readings explains the rest. Check that it is the same "

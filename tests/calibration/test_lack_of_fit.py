@@ -253,6 +253,19 @@ def test_neighbours_are_sought_among_the_same_kind_only():
 
 
 @pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize(("compliance", "said"), [(BENT, True), (0.0, False)])
+def test_an_update_names_an_effect_that_few_rows_did_not_support(compliance, said):
+    """It keeps their model: gravity stayed in 40 configurations that 12 had not shown, and nothing said so."""
+    problem = arm(1, 52, compliance)
+    few, more = (problem.data.take(np.arange(*rows)) for rows in ((12,), (12, 52)))
+    first = ro.calibrate(problem.on(few), model="auto")
+    assert first.learned.extensions == ()
+    found = ro.use.update(first, more)
+    sentence = "An update keeps the model: calibrate all tables together (`rpim-opt new FOLDER --data OLD --data NEW"
+    assert (sentence in str(found)) == (sentence in found.content()["lacking"]) == said
+    assert ("gravity" in lack_of_fit(found.result).missing) == said
+
+
 def test_the_report_says_it():
     result = learned(1, compliance=BENT)
     text = re.sub("</?code>", "`", unescape(page(result)))
