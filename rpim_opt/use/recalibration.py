@@ -263,14 +263,13 @@ def update(
     say = progress or (lambda step: None)
     problem = with_data(result, data)
     free = problem.parameters.free
-    matches = matching(free, reset, "update, reset") if reset else np.zeros(len(free), dtype=bool)
-    released = tuple(np.array(free.names)[matches].tolist())
+    released = tuple(np.array(free.names)[matching(free, reset, "update, reset")].tolist()) if reset else ()
     say("comparing with the previous calibration")
     elsewhere = "" if released else _base_elsewhere(result, problem, prior_inflation)
-    if elsewhere:
-        released = tuple(name for name in free.names if name.startswith(registration(free, data)))
-    # a frame that was reset may be anywhere: then it is registered again
-    start = None if released else previous_deviations(result, problem)
+    base = tuple(name for name in free.names if name.startswith(registration(free, data)))
+    released = base if elsewhere else released
+    # a base that was reset may be anywhere: then it is registered again
+    start = None if base and {*base} <= {*released} else previous_deviations(result, problem)
     changes: list[Cause] = []
     first: tuple[tuple[Cause, ...], Fit] | None = None  # before anything is released
     while True:
@@ -299,13 +298,13 @@ def update(
             found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
             raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
-    p, x = updated.problem.parameters, updated.x  # scales say how far a frame may be, and one that was reset is there
-    frames = np.isin(p.free.names, released) & p.free.of_frames
-    if (frames & (np.abs(x) > p.free.scale)).any():
-        scale = p.scale.copy()
-        scale[p.identified] = np.where(frames, np.maximum(p.free.scale, np.abs(x)), p.free.scale)
-        problem = problem.with_parameters(replace(p, scale=scale))
-        updated = _recalibrated(result, problem, released, prior_inflation, x)
+    p = updated.problem.parameters  # scales say how far a frame may be, and one that was released is there
+    size = p.scale.copy()
+    size[p.identified] = np.abs(updated.x)
+    farther = np.isin(p.names, released) & p.of_frames & (size > p.scale)
+    if farther.any():
+        problem = problem.with_parameters(replace(p, scale=np.where(farther, size, p.scale)))
+        updated = _recalibrated(result, problem, released, prior_inflation, updated.x)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     last = Earlier(
         result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],

@@ -188,6 +188,8 @@ def test_a_base_that_was_reset_is_within_its_scale() -> None:
     assert [cause.name for cause in found.changes] == ["theta4"]
     (theta4,) = (each for each in found.moved if each.name == "theta4")
     assert abs(theta4.change - 0.02) < 4 * theta4.std
+    part = ro.use.update(first, robot.after, reset=("base_x", "base_y", "base_rz"))  # what is known is about its axes
+    assert [cause.name for cause in part.changes] == ["theta4"]
 
 
 @pytest.mark.parametrize(("rows", "undetermined"), [(2, ("base",)), (3, ())])
