@@ -84,12 +84,15 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
 
 @pytest.mark.parametrize(("off", "said"), [("base", "the stated base is wrong"), ("tool", "the stated tool is wrong")])
 def test_a_frame_that_is_held_elsewhere_is_named_without_curves(monkeypatch, off, said):
-    """Fits of hundreds of coefficients, one for all that is held, took ten times the calibration's time."""
+    """Fits of hundreds of coefficients, one for all that is held, took ten times the calibration's time.
+
+    Beside the wrong tool a curve over more than the measured range would stand for it, and is not admitted.
+    """
     problem, _ = measured(SIZE)
     p = problem.parameters
     moved = p.nominal + np.isin(p.names, [f"{off}_x", f"{off}_y"]) * 4e-3
     result = ro.calibrate(problem.with_parameters(dataclasses.replace(p, nominal=moved)), model="auto")
-    assert result.learned.curves is not None
+    assert (result.learned.curves is not None) == (off == "base")
     counts = []
     fit = verdict.ridge_deviations
     monkeypatch.setattr(
