@@ -655,8 +655,7 @@ def design(
         say(f"choosing {count} of {len(q)} candidates")
         chosen = ro.problem.choose(posed, q, count, criterion, measured=posed.data if augment else None)
     if augment:
-        where += "\nThen calibrate all tables together (`new FOLDER --data OLD --data NEW ...`, `calibrate`); `update` "
-        where += "keeps the model of a result."
+        where += "\nThen calibrate all tables together (`new FOLDER --data OLD --data NEW`); `update` keeps the model."
     columns = joint_cells(posed.robot, q[chosen.chosen], chosen.chosen)
     label = None if table is None else read_columns(table).get("label")
     if label is not None:

@@ -26,7 +26,7 @@ def test_what_is_measured_already_counts_in_a_design(monkeypatch: pytest.MonkeyP
     assert (new >= q.min(axis=0) - 1e-3).all()
     assert (new <= q.max(axis=0) + 1e-3).all()
     assert run(monkeypatch, *asked[:-1], "--augment") == 0
-    assert "calibrate all tables together (`new FOLDER --data OLD --data NEW ...`" in capsys.readouterr().out
+    assert "calibrate all tables together (`new FOLDER --data OLD --data NEW`)" in capsys.readouterr().out
 
 
 def test_a_table_of_candidates_keeps_its_labels(monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Any) -> None:
