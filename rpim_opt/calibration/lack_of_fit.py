@@ -148,9 +148,11 @@ class LackOfFit:
         if self.missing:
             what = joined([EXTENSIONS[extension].name for extension in self.missing])
             remedy = f': add {joined(self.parameters)} to `identify`, or model = "auto".'
+            if self.updated:
+                remedy = f". {TOGETHER}"
             lines.append(
                 f"{what[0].upper()}{what[1:]} would explain {self.share:.0%} of the mean square residual (likelihood-"
-                f"ratio statistic {self.gain:.0f}){f'. {TOGETHER}' if self.updated else remedy}"
+                f"ratio statistic {self.gain:.0f}){remedy}"
             )
         if self.upward:
             said = upward_sentence(self.upward)
@@ -352,11 +354,11 @@ def _limit(found: LackOfFit) -> str:
     """Say what limits the result: an effect that the model lacks, the robot or the instrument."""
     if found.autocorrelation is not None and found.autocorrelation.z > CORRELATED:
         even = "Even then, residuals" if found.missing else "Residuals"
+        together = f" {TOGETHER}" if found.updated and not found.missing else ""
         return (
             f"{even} of neighbouring configurations are correlated ({found.autocorrelation.correlation:.2f}, z = "
-            f"{found.autocorrelation.z:.0f}): the model lacks an effect, which averaging more readings does not remove."
-            + f" {TOGETHER}"
-            * (found.updated and not found.missing)
+            f"{found.autocorrelation.z:.0f}): the model lacks an effect, which averaging more readings does not "
+            f"remove.{together}"
         )
     if found.robot > GROSS * found.instrument:
         return "No robot has such poor repeatability: check units, signs, frames and rows first."

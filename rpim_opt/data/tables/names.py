@@ -158,7 +158,8 @@ def numbered(read: Meanings, table: Columns, dof: int, order: str) -> None:
     columns = quaternion_columns(read, dof)
     if order and not columns:
         columns = [name for name, each in read.items() if each.stem in ("qw", "qx", "qy", "qz")]
-    for i, (name, letter) in enumerate(zip(columns, order or "wxyz", strict=False), start=1):
+    order = order or ORDERS[0]
+    for i, (name, letter) in enumerate(zip(columns, order, strict=False), start=1):
         read[name] = read[name]._replace(stem=f"q{letter}", why=f"component {i} of a quaternion, order {order}")
     stems = {reading.stem for reading in read.values()}
     if {"qx", "qy", "qz"} <= stems and "qw" not in stems:
