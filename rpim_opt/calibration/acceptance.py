@@ -28,7 +28,7 @@ from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage
-from rpim_opt.calibration.verdict import Verdict, like_a_frame, refuse_misread
+from rpim_opt.calibration.verdict import Verdict, ambiguous_deviation, refuse_misread
 from rpim_opt.calibration.words import VAGUE, underdetermined
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut, Requirement
@@ -346,9 +346,9 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     lacking = [*_unmodelled(result, region), *unheld]
     if result.contradiction:
         lacking.append("Missing: constraints that agree with the data; U depends on them.")
-    if like_a_frame(result):
-        check = "Missing: a check of the stated frame below, whose error U does not contain. If it is right, "
-        lacking.append(f"{check}write the parameter that deviates into the robot's file as identified.")
+    if ambiguous_deviation(result):
+        check = "Missing: a check of the frame or scale below, whose error U does not contain. If it is right, "
+        lacking.append(f"{check}write the parameters that deviate into the robot's file as identified.")
     undecided = () if result.mapping is None else result.mapping.ambiguities
     lacking += [reason for reason in result.verdict.reasons if reason in undecided]
     against = [reason for reason in result.verdict.reasons if reason not in undecided]

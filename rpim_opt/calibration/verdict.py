@@ -131,7 +131,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     limited. Where the formulation limits the fit, other reasons than held-out rows follow from that, and are not named.
     """
     mapping = result.mapping.caution if result.mapping else ""
-    caution = " ".join(filter(None, [mapping, result.contradiction, like_a_frame(result)]))
+    caution = " ".join(filter(None, [mapping, result.contradiction, ambiguous_deviation(result)]))
     limited = tuple(text for text in causes if LIMITED in text)
     if limited:
         return Verdict((*limited, *_worse(result)), caution)
@@ -148,8 +148,8 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     return Verdict(tuple(dict.fromkeys(reasons)), caution)
 
 
-def like_a_frame(result: Outcome) -> str:
-    """Return a sentence if errors of stated frames look to the data like the largest deviation of the robot.
+def ambiguous_deviation(result: Outcome) -> str:
+    """Return a sentence if errors of stated frames or of a scale look to the data like deviations of the robot.
 
     A wrong length of a stated tool is a deviation of the last d, a wrong place beside the last axis one of its theta.
     """

@@ -508,6 +508,6 @@ def test_a_deviation_that_may_be_an_error_of_the_stated_tool_is_not_accepted() -
     acceptance = ro.calibration.accept(result, ro.data.Requirement(5e-4))
     assert acceptance.verdict == "inconclusive"
     (reason,) = acceptance.reasons
-    assert reason.startswith("Missing: a check of the stated frame")
+    assert reason.startswith("Missing: a check of the frame or scale")
     moved = ro.use.compensate(result, instance.validation.q, tool=[0.1, 0, 0.2, 0, 0, 0])
     assert "an error of the stated tool_z: check it." in str(moved)
