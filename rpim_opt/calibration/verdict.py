@@ -47,8 +47,8 @@ MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), 
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
 UNUSUAL = {"length": 0.004, "angle": 0.05}
 """Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
-SCALED = 0.002  # common deviation of the longest link [m] from which a wrong scale is the likelier reason,
-SIGMAS, COMMON = 3.0, 0.6  # its standard deviations, as lengths deviate by chance, and its part of what they deviate
+SCALED = 0.002  # common deviation of the longest link [m] from which a wrong scale is the likelier reason
+SIGMAS, COMMON = 3.0, 0.6  # standard deviations of it that chance does not make, and its least part of all deviations
 ALIKE = 0.045  # part of an effect on the data that others may leave where these do not distinguish them
 DEPENDENT = 1e-6  # singular value of effects, over the largest, below which they are combinations of the others
 TAKES_PART = 0.1  # part of the largest share in an effect from which on a frame parameter is named

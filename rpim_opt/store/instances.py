@@ -86,8 +86,8 @@ class Instance(Tabled):
     def calibrate(self, **changes: Any) -> Calibration:
         """Return the calibration with the folder's settings and record.
 
-        ``changes`` are arguments of `calibrate` to use instead: ``weight="reml"``, ``formulation="robust"``, which has
-        the file's constraints, too, as a `Formulation` has not.
+        ``changes`` are arguments of `calibrate` to use instead: ``weight="reml"``, ``formulation="robust"``. The file's
+        constraints hold beside a ready formulation; a `Formulation` object states its own.
         """
         if isinstance(changes.get("formulation"), str):
             ready = formulation_of(changes["formulation"])
