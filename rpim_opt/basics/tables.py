@@ -254,6 +254,8 @@ def decoded(path: Path, encoding: str = "") -> tuple[str, tuple[str, ...]]:
             if ZEROS in block:
                 raise binary
     data = read_bytes(path, LARGEST_DATA)
+    if data.startswith((b"\x1f\x8b", b"BZh", b"PK\x03\x04")):
+        raise InputError("the text", "a compressed file", "a text file: unpack it first")
     name, why = (encoding, "as requested") if encoding else _encoding(data)
     try:
         text = data.decode(name)

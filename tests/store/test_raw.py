@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import re
 from pathlib import Path
@@ -232,6 +233,13 @@ def test_what_may_mean_two_things_is_refused(monkeypatch, capsys, tmp_path, arm,
     for part in expected:
         assert part in said, said
     assert not (tmp_path / "cell").exists()
+
+
+def test_a_compressed_table_is_to_be_unpacked(monkeypatch, capsys, tmp_path, arm) -> None:
+    path = tmp_path / "raw.csv.gz"
+    path.write_bytes(gzip.compress(text([HEAD], ROWS).encode()))
+    assert new(monkeypatch, arm, tmp_path / "cell", path) == 2
+    assert "found a compressed file, accepted: a text file: unpack it first" in capsys.readouterr().err
 
 
 def test_a_xacro_file_is_refused_with_the_command_that_expands_it(monkeypatch, capsys, tmp_path) -> None:
