@@ -135,15 +135,15 @@ def _contradicted(fit: Fit) -> Iterator[str]:
         if not beyond:
             return
         worst = max(beyond, key=lambda key: chi2[key] / len(groups[key]))
-        sizes = []
-        for i, size in zip(groups[worst], off[worst], strict=True):
+        amounts = []
+        for i, amount in zip(groups[worst], off[worst], strict=True):
             factors = np.abs(known[i].rows[0])
             unit, si = display(known[i].dimensions[int(factors.argmax())])
-            sizes.append(f"{size / factors.max() / si:+.3g} {unit}")
+            amounts.append(f"{amount / factors.max() / si:+.3g} {unit}")
         named = joined([f"'{known[i].text}'" for i in groups[worst]])
         yield (
-            f"The data contradict prior {named}, by {joined(sizes)} (chi-squared {chi2[worst]:.0f} of {len(sizes)}). "
-            "Correct what is stated, or take it out of the prior."
+            f"The data contradict prior {named}, by {joined(amounts)} (chi-squared {chi2[worst]:.0f} of "
+            f"{len(amounts)}). Correct what is stated, or take it out of the prior."
         )
         left = np.setdiff1d(np.arange(len(known)), groups[worst])
         known, R, d, S = [known[i] for i in left], R[left], d[left], S[np.ix_(left, left)]

@@ -120,7 +120,7 @@ class Outcome:
         Without constraints the sum of squares falls by chi-square of as many degrees of freedom as are active, if they
         hold for the robot, times the residuals' variance where that is larger than the noise. Of a robust loss they
         are the squares of what it keeps without constraints. A penalty that is not quadratic is no prior: it must not
-        be what falls alone, and parameters at its kinks count as active.
+        be what falls alone, and parameters where its slope jumps count as active.
         """
         program = self.program
         if not self.formulation.solvable or self.moves is None:
@@ -140,9 +140,9 @@ class Outcome:
         if chdtrc(active, max(fall, 0.0) / variance) > CONTRADICTED:
             return ""
         names = joined([name_of(constraint, k) for k, constraint in enumerate(self.formulation.constraints)])
-        conditional = (
-            "" if self.no_intervals else "Standard deviations and intervals are conditional on them and too small. "
-        )
+        conditional = ""
+        if not self.no_intervals:
+            conditional = "Standard deviations and intervals are conditional on them and too small. "
         return (
             f"The data contradict constraints ({names}): without them the objective is {three_digits(without)} instead "
             f"of {three_digits(held)}. {conditional}Check the drawing and the nominal robot, or loosen them."

@@ -298,13 +298,7 @@ def update(
             found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
             raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
-    p = updated.problem.parameters  # scales say how far a frame may be, and one that was released is there
-    size = p.scale.copy()
-    size[p.identified] = np.abs(updated.x)
-    farther = np.isin(p.names, released) & p.of_frames & (size > p.scale)
-    if farther.any():
-        problem = problem.with_parameters(replace(p, scale=np.where(farther, size, p.scale)))
-        updated = _recalibrated(result, problem, released, prior_inflation, updated.x)
+    updated = _with_scales_of_motion(result, updated, problem, released, prior_inflation)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     last = Earlier(
         result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],
@@ -383,6 +377,23 @@ def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation:
         f"The instrument or the base moved: in the instrument's frame the base is at {placed(now)}, previously at "
         f"{placed(was)}. It was registered again, as with --reset '{place}*'."
     )
+
+
+def _with_scales_of_motion(
+    result: Calibration, updated: Calibration, problem: CalibrationProblem, released: tuple[str, ...], inflation: float
+) -> Calibration:
+    """Return the update with frames that were released as far from nominal as their scales say, or nearer.
+
+    A base that was reset is far beyond its scale, which later tests would take for a deviation of the robot.
+    """
+    p = updated.problem.parameters
+    distance = p.scale.copy()
+    distance[p.identified] = np.abs(updated.x)
+    farther = np.isin(p.names, released) & p.of_frames & (distance > p.scale)
+    if not farther.any():
+        return updated
+    problem = problem.with_parameters(replace(p, scale=np.where(farther, distance, p.scale)))
+    return _recalibrated(result, problem, released, inflation, updated.x)
 
 
 def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
