@@ -277,6 +277,8 @@ class Dataset(Tabled):
             q = q[:, None]
         N = len(q)
         points, c = measurement.points, len(measurement.columns)
+        if not N:
+            raise InputError("q", "no rows", "one or more")
         for name, values in (("q", q), ("y", y)):
             for row in np.flatnonzero(~(np.abs(values) <= LARGEST).reshape(len(values), -1).all(axis=1)).tolist():
                 accepted = f"finite numbers of at most {LARGEST:g} m or rad"

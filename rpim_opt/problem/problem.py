@@ -48,6 +48,7 @@ from rpim_opt.robot.parameters import (
 from rpim_opt.robot.terms import Curve, Model, transmission
 
 SHIFTED = ("base_x", "base_y", "base_z")  # parameters that move the whole robot
+MOST_TURNS = 4  # of a joint's value; more are degrees
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -234,6 +235,8 @@ class CalibrationProblem(RobotModel):
 
         InputError when data and parameters do not fit, or compliances have measured torques here and not there.
         """
+        if not isinstance(data, Dataset):
+            raise InputError("data", f"a {type(data).__name__}", "a Dataset, as of Dataset.of(q, y, sigma)")
         here, there = ({block.robot for block in each.blocks} for each in (self.data, data))
         for name in here & there:
             measured = measured_torques(self.data, name), measured_torques(data, name)
@@ -261,6 +264,10 @@ class CalibrationProblem(RobotModel):
         arm = self.alone(robot)
         q = np.atleast_2d(np.asarray(q, dtype=float))
         N = len(q)
+        turning = [dimension == "angle" for dimension in arm.robot.joint_dimensions]
+        if q.shape[-1] == len(turning) and np.abs(q[:, turning]).max(initial=0.0) > MOST_TURNS * 2 * np.pi:
+            found = f"{np.abs(q[:, turning]).max():.6g} rad"
+            raise InputError("q", found, f"at most {MOST_TURNS} turns: are these degrees? Use np.radians(q)")
         if payload is not None:
             require_known_masses(arm.robot, arm.parameters, arm.data, np.asarray(payload, dtype=float))
         y = np.zeros((N, len(measurement.columns)))

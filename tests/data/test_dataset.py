@@ -111,6 +111,7 @@ def test_sigmas_of_components_and_poses_as_transforms() -> None:
     ("q", "y", "sigma", "sentence"),
     [
         (np.full((2, 6), np.nan), np.zeros((2, 3)), 1e-5, r"q, row 1: found \[nan, .*accepted: finite numbers"),
+        ([], [], 1e-5, "q: found no rows, accepted: one or more"),
         (np.zeros((2, 6)), [[0.0, 0.0, 0.0], [0.0, np.inf, 0.0]], 1e-5, r"y, row 2: found \[0.0, inf, 0.0\]"),
         (
             np.zeros((2, 6)),

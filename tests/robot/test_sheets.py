@@ -111,7 +111,7 @@ def test_an_index_of_the_link_before_says_that_it_is_modified(tmp_path: Path, he
         ),
         (
             "dh.md",
-            "# KR 6 R900\n\n| Kinematics | theta [rad] | a [m] | d [m] | alpha [rad] |\n|---|---|---|---|---|\n"
+            "# KR 6 R900\n\n| Kinematics | theta [rad] | a [m] | d [m] | alpha |\n|---|---|---|---|---|\n"
             "| Joint 1 | 0 | 0.025 | 0.4 | \u2212\u03c0/2 |\n| Joint 2 | 0 | 0.455 | 0 | 0 |\n"
             "| Joint 3 | -pi/2 | 0.035 | 0 | -pi/2 |\n| Joint 4 | 0 | 0 | 0.42 | 0.5 * pi |\n"
             "| Joint 5 | 0 | 0 | 0 | -\u03c0/2 |\n| Joint 6 | 0 | 0 | 0.08 | 0 |\n",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +139,16 @@ def test_two_checks_show_no_course() -> None:
 def test_what_a_formulation_cannot_do_is_said() -> None:
     with pytest.raises(ro.InputError, match="the penalty of formulation 'lasso' is not quadratic"):
         ro.use.monitor(calibrated("lasso"), checks())
+
+
+def test_a_script_is_told_of_degrees_and_of_arrays_that_are_no_dataset() -> None:
+    result, degrees = calibrated(), [[10.0, -90.0, 45.0, 0.0, 30.0, 0.0]]
+    for use in (result.forward, result.predict, partial(ro.use.compensate, result)):
+        with pytest.raises(ro.InputError, match=r"q: found 90 rad, accepted: at most 4 turns: are these degrees"):
+            use(degrees)
+    for use in (result.errors, partial(ro.use.validate, result), result.problem.on):
+        with pytest.raises(ro.InputError, match="data: found a ndarray, accepted: a Dataset"):
+            use(np.zeros((3, 3)))
 
 
 def test_a_robot_and_a_payload_that_are_none_are_refused() -> None:

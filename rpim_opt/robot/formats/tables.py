@@ -227,6 +227,8 @@ def _sheet_columns(header: Mapping[str, Sequence[Any]]) -> dict[str, list[str]]:
             continue
         if stem in ANGLES and not unit and any("°" in text for text in texts):
             unit = "deg"
+        elif stem in ANGLES and not unit and any("pi" in text.lower() or "π" in text for text in texts):
+            unit = "rad"
         if stem == "limits":
             raise InputError("the header", f"both limits in a column, '{name}'", "columns lower [deg] and upper [deg]")
         key = stem + (f"_{unit}" if unit else "")
