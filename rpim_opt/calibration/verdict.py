@@ -29,6 +29,7 @@ from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
+from rpim_opt.problem.registration.points import of_sessions
 from rpim_opt.problem.row_functions import measured_torques
 from rpim_opt.robot.mdh import MDH, Robot, numbered
 from rpim_opt.robot.parameters import frame_of, own_name
@@ -496,15 +497,16 @@ def _beside_a_good_fit(
     ``together`` are sentences on rows that were left out next to each other, ``noticed`` is whether residuals are
     beyond the noise.
     """
-    kept = kept_rows(result)
+    kept, parts = kept_rows(result), of_sessions(ordered)
     causes = list(diagnosis.filled_rows(ordered.data))  # which may fit
     if result.excluded is not None and len(problem.arms) == 1:
-        by_result = replace(ordered, robots=result.robot)
+        by_result = [replace(part, robots=result.robot) for part in parts]
+        explained = (diagnosis.other_places, diagnosis.other_rows)
         causes = first(
-            diagnosis.single_rows(ordered), diagnosis.other_places(by_result), diagnosis.other_rows(by_result)
+            *map(diagnosis.single_rows, parts), *(explain(part) for explain in explained for part in by_result)
         )
     elif result.excluded is not None or not kept.all():
-        causes = list(diagnosis.single_rows(ordered))
+        causes = first(*map(diagnosis.single_rows, parts))
     if causes:
         causes[-1] += " The other rows fit: calibrate again with these corrected, or left out ([exclude])."
         return causes, []
@@ -659,10 +661,11 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
     explained = max(ratio for _, ratio in residual_rms(result, kept).values()) < NOTICED
     most = REACH * arm_length(problem) if explained else np.inf  # else wrong lengths explain more
     outside = diagnosis.beyond_limits(problem.robot, diagnosis.all_q(problem.data), OUTSIDE)
+    parts = of_sessions(ordered)
     # beside single rows, which may be the ones where something changed
     return first(
         (f"{text}: check the unit and the column of its values." for text in outside),
-        chain(diagnosis.single_rows(ordered), diagnosis.better_interpretations(ordered, most)),
+        *(chain(diagnosis.single_rows(part), diagnosis.better_interpretations(part, most)) for part in parts),
         _shown_without_outliers(result, ordered),
         diagnosis.rounded(problem, error),
         diagnosis.odd_column(problem) if beyond else (),

@@ -843,7 +843,8 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
         if names:
             what = names[0].split("_")[0]
             placed[what] = ([*placed.get(what, [()])[0], *names], "did it, or the robot's base, move")
-    if not set(p.free.names) & {name for names, _ in placed.values() for name in names}:
+    apart = any(map(of_session, p.free.names))
+    if not apart and not set(p.free.names) & {name for names, _ in placed.values() for name in names}:
         return
     markers = dict.fromkeys(marker for block in blocks for marker in block.markers)
     parts = dict(placed)
@@ -851,14 +852,15 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
     every = np.array(p.names)
     bends, eccentric = np.char.startswith(every, "compliance"), np.char.startswith(every, "ecc_")
     parts["payload"] = (every[bends].tolist(), "did the load at the flange change")
-    whole = problem.identifying(p.identified | bends | eccentric)  # a payload shows in them, identified or not
+    based = apart & np.isin(every, placed["base"][0])  # a base may move within a session, too
+    whole = problem.identifying(p.identified | bends | eccentric | based)  # a payload shows in them, identified or not
     there = np.zeros(len(whole.parameters.free))
     there[p.identified[whole.parameters.identified]] = x
     A = whole.linearize(there).A
     shares = _shares(problem)
     free, named = whole.parameters.free, problem.data.sessions
     base = np.flatnonzero(np.isin(free.names, SHIFTED))
-    if len(base) and 1 < len(named) <= len(problem.data) / FEWEST and not any(map(of_session, free.names)):
+    if len(base) and 1 < len(named) <= len(problem.data) / FEWEST and not apart:
         apart = A[:, base, None] * (problem.data.session[problem.owners, None] == np.array(named[1:]))[:, None]
         between = f"the base differs from session to session ({listed(named)})"
         remedy = 'did it move between them? Add `session_*` to `identify`, or model = "auto"'

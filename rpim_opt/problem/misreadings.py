@@ -21,7 +21,16 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import proper, transforms
 from rpim_opt.problem.registration.global_start import QUARTER, UNEXPLAINED, WRITE, JointMapping, explained, search
-from rpim_opt.problem.registration.points import Points, fit_points, lengths_of, mirrored, misfit, misfits, points_of
+from rpim_opt.problem.registration.points import (
+    Points,
+    fit_points,
+    lengths_of,
+    mirrored,
+    misfit,
+    misfits,
+    of_sessions,
+    points_of,
+)
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, robots
@@ -449,6 +458,7 @@ def better_interpretation(problem: CalibrationProblem, whole: bool = True) -> Be
     cannot be right, all orders of up to six joints, and the ready robots, which no part of a ``whole`` table has for
     itself. Base or anchor and reflectors are fitted anew for every reading.
     """
+    problem = of_sessions(problem)[0]
     points = points_of(problem) or lengths_of(problem)
     if points is None:
         return None
@@ -526,6 +536,7 @@ def _mapping_behind(points: Points) -> Better | None:
 
 def sibling(problem: CalibrationProblem) -> Better | None:
     """Return the ready robot of nearly the same parameters that fits far better, a UR10e for a UR10; or None."""
+    problem = of_sessions(problem)[0]
     points = points_of(problem) or lengths_of(problem)
     if points is None or points.by_camera:
         return None

@@ -213,7 +213,7 @@ def in_time_order(found: Interpretation) -> Interpretation:
                 tables = _with_meaning(found.tables, [name.lower()], meaning="order of the rows", why="times")
                 notes = (*found.notes, f"rows are in the order of '{name}'.")
                 return replace(found, columns=columns, raw=raw, tables=tables, notes=notes)
-    why = "neither dates (2026-05-31T12:00:00, 31.05.2026 12:00:00) nor times since 1970"
+    why = "neither dates (2026-05-31T12:00:00, 31.05.2026 12:00:00) nor times since 1970: the rows stay as they are"
     tables = _with_meaning(found.tables, [name.lower() for name in clocks], why=why)
     return replace(found, columns=columns, tables=tables)
 

@@ -591,9 +591,11 @@ class _Cell(NamedTuple):
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
         every = np.arange(len(poses))
         n = self.robot.dof
+        low, high = self.robot.limits.T
+        turn = np.where(np.array(self.robot.joint_dimensions) == "angle", 2 * np.pi, np.inf)
 
         def found(rows: np.ndarray, start: Array, W: Array) -> tuple[Array, Array, np.ndarray]:
-            limits = self.robot.limits[:, 0], self.robot.limits[:, 1]
+            limits = np.maximum(low, start - turn), np.minimum(high, start + turn)
             return nearest(self.nominal, load[rows], poses[rows], start, limits, W, np.zeros((1, n, n)))
 
         all_count = np.eye(len(self.kind.components))[None]

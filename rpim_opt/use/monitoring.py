@@ -11,6 +11,7 @@ import scipy
 from scipy.special import fdtrc, fdtri, ndtr, ndtri
 
 from rpim_opt.basics.arrays import Array, finite_numbers
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.bayes.outliers import by_block
@@ -166,7 +167,8 @@ def monitor(
     The result has a squared penalty or none. ``data`` are check readings in the instrument's frame of the calibration,
     in the order of ``when`` (N,) [s] if that is stated; ``times`` are their N texts. If they ``register``, each of
     their `set_ups` may be in a frame of its own: its motion is unknown in all tests, and takes six equations of them.
-    InputError for times that are not one a check, and a result that has no covariance (lasso).
+    InputError for times that are not one a check, sessions whose registration is unknown, and a result that has no
+    covariance (lasso).
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
@@ -195,13 +197,14 @@ def monitor(
     level = recalibration.FALSE_ALARM / TESTS
     sigmas, deviate, equations = _innovations(result, problem, own, level / count)
     held = held_out_errors(result, data)
+    if unknown := unregistered(result, data, held):  # which a change of the robot would take up
+        raise InputError("the checks", unknown.partition(":")[0].replace("The", "the", 1), "--register")
     return Monitoring(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
         allowed=np.sqrt(equations * fdtri(equations, max(result.noise_dof, 1.0), 1 - level / count)),
         sums=cusum(deviate), limit=cusum_limit(count, level), drift=_drift(result, problem, own, level),
-        registered=motion, mistake=unregistered(result, data, held)
-        or misread(result, data)
-        or recalibration.moved_or_changed(result, data, held)[0],
+        registered=motion,
+        mistake=misread(result, data) or recalibration.moved_or_changed(result, data, held)[0],
     )  # fmt: skip
 
 

@@ -599,6 +599,9 @@ def test_columns_of_other_names_join_two_files(monkeypatch, capsys, tmp_path, ar
         ("Date / Time", "31.05.2026 12:{:02d}"),
         ("Timestamp UTC", "2026-05-31T12:{:02d}:00Z"),
         ("Time (UTC)", "2026/05/31 12:{:02d}:00"),
+        ("Timestamp", "10/05/2026 12:{:02d}:34 PM"),
+        ("Timestamp", "5/31/2026 9:{:02d} AM"),
+        ("Timestamp", "31/05/2026 21:{:02d}:34"),
     ],
 )
 def test_dates_are_the_order_of_the_rows(monkeypatch, capsys, tmp_path, arm, name, cell) -> None:
@@ -608,9 +611,32 @@ def test_dates_are_the_order_of_the_rows(monkeypatch, capsys, tmp_path, arm, nam
     assert new(monkeypatch, arm, tmp_path / "cell", tmp_path / "raw.csv") == 0
     assert f"rows are in the order of '{name}'." in capsys.readouterr().out
     assert list(ro.load(tmp_path / "cell").problem.data.label) == LABELS[::-1]
-    (tmp_path / "raw.csv").write_text(text([[*HEAD, name]], [[*row, "12:00:00 PM"] for row in ROWS]))
+    (tmp_path / "raw.csv").write_text(text([[*HEAD, name]], [[*row, "noon"] for row in ROWS]))
     assert new(monkeypatch, arm, tmp_path / "other", tmp_path / "raw.csv") == 0
     assert re.search(rf"{re.escape(name)} +not used +neither dates \(2026-", capsys.readouterr().out)
+
+
+def test_a_reference_that_was_measured_again_is_no_obstacle_to_a_key(monkeypatch, capsys, tmp_path, arm) -> None:
+    files = [tmp_path / "robot.csv", tmp_path / "tracker.csv"]
+    files[0].write_text(text([["Punkt", *HEAD[1:7]]], [[f"P{i}", *row] for i, row in enumerate(JOINTS)]))
+    rows = [["Robot", f"P{i}", *row] for i, row in enumerate(POINTS)]
+    rows = [["Reference", "REF1", *POINTS[0]], *rows[::-1], ["Reference", "REF1", *POINTS[0]]]
+    files[1].write_text(text([["Group", "Target", *HEAD[7:]]], rows))
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--key", "Target") == 0
+    said = capsys.readouterr().out
+    assert f"{COUNT} rows match, of {COUNT} with joints and {COUNT + 2} measured." in said
+    assert "without a match, ignored: REF1, REF1." in said
+
+
+def test_what_publishers_count_their_messages_by_is_no_key(monkeypatch, capsys, tmp_path, arm) -> None:
+    files = [tmp_path / "robot.csv", tmp_path / "tracker.csv"]
+    head = ["%time", "field.header.seq"]
+    times = [str(1_700_000_000_000_000_000 + 10**9 * i) for i in range(COUNT)]
+    files[0].write_text(text([[*head, *HEAD[1:7]]], [[times[i], str(i), *row] for i, row in enumerate(JOINTS)]))
+    rows = [[times[i], str(i + 2), *row] for i, row in enumerate(POINTS)]
+    files[1].write_text(text([[*head, *HEAD[7:]]], rows))
+    assert new(monkeypatch, arm, tmp_path / "cell", files) == 0
+    assert re.search(rf"joined by [^\n]*time: {COUNT} rows match", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize("key", ["", "Target", "Punkt"])

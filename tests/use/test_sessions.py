@@ -166,7 +166,8 @@ def test_a_third_place_is_no_change_of_the_robot_and_says_nothing_of_it_before_i
     found = ro.use.validate(result, data)
     assert found.coverage is None
     assert "The registration of session 'third' is unknown" in str(found)
-    assert ro.use.monitor(result, data).mistake == found.no_intervals
+    with pytest.raises(ro.InputError, match="found the registration of session 'third' is unknown, accepted: register"):
+        ro.use.monitor(result, data)
     judged = replace(result, record=replace(result.record, validation=data)).verdict
     assert f"Held-out rows do not fit. {found.no_intervals}" in judged.reasons
     updated = ro.use.update(result, data)
@@ -192,6 +193,22 @@ def test_joint_torques_go_with_the_configurations(tmp_path: Path) -> None:
     notes = ro.use.session_notes(ro.use.in_session(result))
     assert "'first'" in notes[0]
     assert "'second'" in notes[0]
+
+
+def test_what_moved_within_a_session_is_named_and_not_the_way_between_them(
+    arm: ro.study.SimulatedArm, result: ro.Calibration
+) -> None:
+    """The way between sessions that are registered one by one was named in its place, with advice that was followed."""
+    rows = result.problem.data.blocks[0]
+    order = np.argsort(result.problem.data.session, kind="stable")[::-1]
+    table = result.problem.parameters.identify(["alpha?", "a?", "d?", "theta?", "tool_[xyz]", "session_*"])
+    for moved in (0.0, 5e-4):
+        y = rows.y[order] + moved * (np.arange(40) >= 28)[:, None] * [1, 0, 0]
+        data = ro.Dataset.of(rows.q[order, 0], y, NOISE, session=result.problem.data.session[order])
+        causes = ro.calibrate(ro.CalibrationProblem(arm.problem.robot, table, data)).causes
+        assert len(causes) == 2 * bool(moved), causes
+    assert "from row 29 on" in causes[1]
+    assert "consistent with a changed base" in causes[1]
 
 
 def test_sessions_that_stand_apart_are_said_to_be_stated_so(arm: ro.study.SimulatedArm, result: ro.Calibration) -> None:

@@ -27,19 +27,24 @@ TIME = re.compile(r"(?i)[%#]?(?:.*[._/ ])?(time ?stamp|date ?time|time|stamp|(uh
                   r"(\W*(utc|gmt|local)\W*)?")  # fmt: skip
 NUMBERED = re.compile(r"(\D*)0*(\d+)\W?")
 GERMAN = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})[ T]*")
+SLASHES = re.compile(r"(\d{1,2})/(\d{1,2})/(\d{4})[ ,T]*")
+ONE_DIGIT = re.compile(r"(?<=[ T])(?=\d:)")  # hours
+HALF_DAY = re.compile(r"(?i)(\d{1,2})(:\d\d.*?)\s*([ap])\.?m\.?")
 UNIT = re.compile(r"(.+?)[\s_]*[\[(/]?\s*\b(s|sec|secs|seconds|ms|us|µs|ns|nsec|nsecs)\b\s*[\])]?", re.IGNORECASE)
 SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "μs": 1e-6, "ns": 1e-9,
            "nsec": 1e-9, "nsecs": 1e-9}  # fmt: skip
 """What a unit is in lower case (`str.casefold`)."""
 STAMP, NANOSECONDS = re.compile(r"(?i)(.*stamp[._/])secs?"), ("nsecs", "nsec", "nanosec")
 """A time of ROS in two columns: its whole seconds, and endings of the other's name."""
+COUNTER = re.compile(r"(?i)(.*[._/ ])?seq")
+"""What a publisher of ROS counts its own messages by: no key of two tables."""
 SAME = 0.8
 """Share of the shorter one's values that two columns of other names have in common where they are one key."""
 OTHER_KEYS = "--key row for rows in the same order, or --time-tolerance for the nearest time"
 SIMULTANEOUS = 0.01
 """Times that differ by less than this part of the shortest time between rows are those of one row."""
-LOG, MOVED = 2, 0.01
-"""Rows of joints a measured one from which on they are a log, and the change of a joint [deg] that is named."""
+LOG, SMALL, MOVED = 2, 0.5, 0.01
+"""Rows of joints a measured one, or median step [deg] of a joint, of a log, and the change [deg] that is named."""
 OFFSETS, STILL = np.linspace(-5, 5, 501), 0.02
 """Offsets of two clocks [s] that are tried, and how long the robot stands still before and after a measurement [s]."""
 RESTING, FEWEST = 0.95, 6  # part of the measured rows at rest with the offset of the clocks, and rows that tell it
@@ -178,6 +183,7 @@ def _key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Key:
     if key == "row":
         return _row_numbers(joints, values, pair if telling else None)
     common = [name for name in joints.raw if name in values.raw]
+    common = [name for name in common if name == key.lower() or not COUNTER.fullmatch(name)]
     stated = key.lower() or (None if telling and pair else _only(common))
     chosen = _labels(joints, values, bool(telling)) if key in ("", "label") else None
     if not chosen and stated in common:
@@ -241,12 +247,17 @@ def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]
 
 
 def _naming(table: CanonicalTable) -> dict[str, list[str]]:
-    """Return the keys of columns, labels or left out, that name every row differently, or every row of a reflector."""
+    """Return the keys of columns, labels or left out, that name every row differently, or every row of a reflector.
+
+    Of measured rows nearly every one: some name is a reference point that was measured again.
+    """
     free = [each.column for each in table.meant if each.name in ("", "label", "configuration")]
+    free = [name for name in free if not COUNTER.fullmatch(name)]
     cells = {name: _normal(table.raw[name.lower()]) for name in free if name.lower() in table.raw}
     markers = table.columns.get("marker", [""] * len(table.labels))
     rows = {name: {*zip(keys, markers, strict=True)} for name, keys in cells.items()}
-    return {name: keys for name, keys in cells.items() if all(keys) and len(rows[name]) == len(keys)}
+    least = len(table.labels) * (1.0 if any(name.startswith("q1") for name in table.columns) else SAME)
+    return {name: keys for name, keys in cells.items() if all(keys) and len(rows[name]) >= least}
 
 
 def _row_numbers(joints: CanonicalTable, values: CanonicalTable, pair: Key | None) -> Key:
@@ -310,12 +321,14 @@ def _by_time(joints: CanonicalTable, values: CanonicalTable, key: str, within: f
         f"joined by the nearest time: {len(right)} rows match, of {len(there)} with joints and {len(then)} measured; "
         f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
     ]
-    moved = _motion(joints, there, there[left], then[right]) if len(there) > LOG * len(right) else np.zeros(1)
-    if moved.max() > MOVED:
+    moved, ordered = _motion(joints, there, there[left], then[right]), np.sort(there)
+    steps = _motion(joints, there, ordered[:-1], ordered[1:])
+    if moved.max() > MOVED and (len(there) > LOG * len(right) or np.median(steps) < SMALL):
         count = np.count_nonzero(moved > MOVED)
         notes.append(
             f"the robot moved by up to {moved.max():.2g} degrees between measurement and joint values in {count} of "
-            f"{len(right)} joined rows: do the clocks differ? {_clocks(joints, there, then[right])}"
+            f"{len(right)} joined rows: leave out rows in which it moves. Or do the clocks differ? "
+            f"{_clocks(joints, there, then[right])}"
         )
     lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right.tolist()))]
     if lonely:
@@ -377,24 +390,44 @@ def time_column(names: Iterable[str]) -> str | None:
 
 
 def seconds(name: str, cells: Sequence[Any]) -> Array:
-    """Return times (N,) [s] from numbers, in the unit of the column's name, or dates (ISO 8601, DIN 1355, UTC)."""
+    """Return times (N,) [s] from numbers, in the unit of the column's name, or from dates: ISO 8601, DIN 1355, UTC.
+
+    Dates with slashes have month and day in the order that a number above 12 shows, in 12 hours the month first.
+    """
     texts = [str(cell).strip() for cell in cells]
     times = np.array([numeral(text) for text in texts])
     dates = bool(np.isnan(times[:1]).any())
     if dates:
-        for i, text in enumerate(texts):
+        for i, text in enumerate(_iso_dates(name, texts)):
             with suppress(ValueError):
-                iso = GERMAN.sub(r"\3-\2-\1 ", text).strip().replace("/", "-")
-                date = datetime.fromisoformat(iso.replace(",", "."))
+                date = datetime.fromisoformat(text)
                 times[i] = date.replace(tzinfo=date.tzinfo or UTC).timestamp()
     for i in np.flatnonzero(np.isnan(times)).tolist():
-        accepted = "numbers, or dates as 2026-05-31T12:00:00 or 31.05.2026 12:00:00"
+        accepted = "numbers, or dates as 2026-05-31T12:00:00, 31.05.2026 12:00:00 or 05/31/2026 12:00:00 PM"
         raise InputError(f"column '{name}', row {i + 1}", f"'{texts[i]}'", accepted)
     if dates:
         return times
     size = np.abs(times).max(initial=0.0)
     guessed = next((unit for least, unit in SINCE_1970 if size >= least), "s")
     return SECONDS[_split_time(name)[1].casefold() or guessed] * times
+
+
+def _iso_dates(name: str, texts: Sequence[str]) -> list[str]:
+    """Return dates of other countries as ISO 8601, all with month and day in the same order."""
+
+    def of_24_hours(half: re.Match[str]) -> str:
+        return f"{int(half[1]) % 12 + 12 * (half[3].lower() == 'p'):02d}{half[2]}"
+
+    parts = [match for match in map(SLASHES.match, texts) if match]
+    month_first = any(map(HALF_DAY.search, texts)) or any(int(match[2]) > 12 for match in parts)
+    day_first = any(int(match[1]) > 12 for match in parts)
+    if not (month_first or day_first) and len({match[0] for match in parts}) > 1:
+        found = f"'{parts[0][0].rstrip()}', whose order of month and day no number above 12 shows"
+        raise InputError(f"column '{name}'", found, "dates as 2026-05-31T12:00:00")
+    month, day = (2, 1) if day_first else (1, 2)
+    iso = [SLASHES.sub(lambda of: f"{of[3]}-{of[month]:0>2}-{of[day]:0>2} ", text) for text in texts]
+    iso = [HALF_DAY.sub(of_24_hours, GERMAN.sub(r"\3-\2-\1 ", text)).strip() for text in iso]
+    return [ONE_DIGIT.sub("0", text.replace("/", "-").replace(",", ".")) for text in iso]
 
 
 def _split_time(name: str) -> tuple[str, str]:

@@ -19,7 +19,7 @@ from rpim_opt.problem.registration.camera import with_poses
 from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, TOOL_ERROR, proper, rigid, transforms
 from rpim_opt.robot.kinematics import FRAME
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameters import tool_prefix
+from rpim_opt.robot.parameters import of_session, tool_prefix
 
 MOST_ROWS = 300  # rows that are tried, evenly spread where there are more
 STEPS = 20  # of a fit of base and reflectors, joint zeros too if they are free
@@ -70,6 +70,15 @@ class Points:
     def lengths(self) -> bool:
         """Whether lengths were measured."""
         return self.y.shape[1] == 1
+
+
+def of_sessions(problem: CalibrationProblem) -> list[CalibrationProblem]:
+    """Return the parts of a problem whose sessions are registered one by one, the largest first; else it alone."""
+    session, free = problem.data.session, problem.parameters.free.names
+    if "base_x" in free or not any(map(of_session, free)):
+        return [problem]
+    names, count = np.unique(session, return_counts=True)
+    return [problem.on(problem.data.take(np.flatnonzero(session == names[k]))) for k in np.argsort(-count)]
 
 
 @lru_cache(maxsize=2)  # poses of a camera's views take seconds
