@@ -22,7 +22,7 @@ from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import seconds, time_column, together
-from rpim_opt.data.tables.names import ORDERS, recognize
+from rpim_opt.data.tables.names import NUMBERED, ORDERS, recognize
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import CanonicalTable, Column, interpret
 from rpim_opt.problem.misreadings import pose_misfit
@@ -254,4 +254,5 @@ def _checked(first: Interpretation, files: Files, arm: RobotSetup, doubt: str, t
         accepted = "--quaternion wxyz or xyzw, or names qw, qx, qy, qz"
         raise InputError("the order of the quaternion", f"an ambiguous order ({figures})", accepted, first.file)
     note = f"the quaternion's order is {best}: nominal rotation errors {figures}."
-    return replace(alternatives[best], notes=(*alternatives[best].notes, note))
+    found = alternatives[best]
+    return replace(found, notes=(*found.notes, note), options=replace(found.options, quaternion=NUMBERED + best))

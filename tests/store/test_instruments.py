@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
+from rpim_opt.basics.files import read_toml
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
 from tests.store.fresh_files import FRESH
@@ -97,6 +98,14 @@ def test_new_measurements_are_read_as_the_clean_table(tmp_path, calibrated, name
     options = {"within" if key == "time-tolerance" else key: text for key, text in stated.items()}
     stated = ro.data.TableOptions.stated(options)
     assert_clean(ro.use.read_measurements(calibrated[kind], write(tmp_path), options=stated).data, kind)
+
+
+def test_an_order_found_for_numbered_columns_leaves_names_of_other_tables(monkeypatch, empty, calibrated) -> None:
+    write, _, _ = RAW["quaternion Q0 to Q3, w first"]
+    assert new(monkeypatch, write(empty).name) == 0
+    stated = ro.data.TableOptions.stated(read_toml(Path("cell/problem.toml"))["reading"])
+    named = RAW["quaternion of named components"][0](empty)
+    assert_clean(ro.use.read_measurements(calibrated["pose"], named, options=stated).data, "pose")
 
 
 @pytest.mark.parametrize(("unit", "si"), [("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("µs", 1e-6), ("ns", 1e-9)])

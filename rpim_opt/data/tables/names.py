@@ -141,7 +141,8 @@ def endings(stem: str) -> Iterator[tuple[str, str]]:
         yield stem[: match.end()], stem[match.end() :]
 
 
-ORDERS = ("wxyz", "xyzw")
+ORDERS, NUMBERED = ("wxyz", "xyzw"), "numbered "
+"""Orders of quaternions, and what stands before one that was found by a check: it holds for numbered columns alone."""
 QUATERNION = re.compile(r"(q|quat|quaternion|orientation|orient|rot|rotation)[_ ]?\[?([0-4])\]?")
 ENTRY = re.compile(r"(?:m|t|h|r(?=\D*\d\D*\d)|mat|matrix|tf|pose)[_ \[(]*(\d)[_ ,\]\[]*(\d?)[\])]?")
 SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
@@ -153,10 +154,11 @@ ROUNDED = 1e-6  # the last row of a matrix is 0 0 0 1 within this
 
 def numbered(read: Meanings, table: Columns, dof: int, order: str) -> None:
     """Name the numbered columns of quaternions and matrices; if an order is stated, others of a quaternion, too."""
+    order, of_all = order.removeprefix(NUMBERED), order in ORDERS
     if order not in ("", *ORDERS):
         raise InputError("--quaternion", f"'{order}'", " or ".join(ORDERS))
     columns = quaternion_columns(read, dof)
-    if order and not columns:
+    if of_all and not columns:
         columns = [name for name, each in read.items() if each.stem in ("qw", "qx", "qy", "qz")]
     order = order or ORDERS[0]
     for i, (name, letter) in enumerate(zip(columns, order, strict=False), start=1):
