@@ -195,7 +195,7 @@ class Tables(NamedTuple):
 
     units: Units = ""
     sheet: Annotated[str, Option(help="Excel sheet, by name or number; several as Joints,Points.")] = ""
-    columns: Annotated[str, Option(help="Column names of a table without a header: label,q1_deg,...")] = ""
+    columns: Annotated[str, Option(help="Column names of files without a header: label,q1_deg,...")] = ""
     key: Annotated[str, Option(help="Column by which several files are joined; row joins by row number.")] = ""
     within: Annotated[Number, Option("--time-tolerance", help=NEAREST)] = None
     quaternion: Annotated[str, Option(help="Order of a quaternion's numbered components, wxyz or xyzw.")] = ""

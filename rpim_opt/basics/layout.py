@@ -120,13 +120,15 @@ class RawTable:
 
     ``columns`` are cells by what stands above them, ``Position X [mm]`` (a name that is there again has its place
     behind it, ``X #7``), ``groups`` what of it groups columns; ``notes`` tell how it was read, and what was left out, a
-    sentence each; ``units`` are those that stand above the header, as `parse_units` has them.
+    sentence each; ``units`` are those that stand above the header, as `parse_units` has them; ``left`` are the rows
+    below it that are left out.
     """
 
     columns: Columns
     groups: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    left: Sequence[Sequence[str]] = ()
 
     def with_constants(self, constants: Sequence[str]) -> RawTable:
         """Return the table with columns of one value each, ``torso_lift [m]=0.15``."""
@@ -184,6 +186,8 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
         raise InputError("the table", found, "at least one row of numbers")
     numeric = _without_numbered_header([i for i, count in enumerate(counts) if count >= FULL * most], grid.rows)
     heads, above = _heads(grid, numeric, options)
+    others = () if len(heads) == len(options.columns) else options.columns  # another file's, without a header
+    options = replace(options, columns=() if others else options.columns)
     begins = {i: "".join(filter(str.isalpha, next(filter(None, grid.rows[i])))) for i in numeric}
     full = [i for i in numeric if begins[i].lower() not in SUMMARIES]
     stated = [(row, _stated_units(row)) for row in grid.rows[: above[0] if above else 0]]
@@ -191,8 +195,9 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     lines_of_units = [f"units above the header: {' '.join(filter(None, row))}." for row, of_row in stated if of_row]
     table = _columns([grid.rows[i] for i in full], heads, replace(options, units={**units, **options.units}))
     left = set(range(numeric[0], len(grid.rows))).difference(full)
+    lines_of_units += [f"--columns has {len(others)} names: the {len(heads)} of the header count."] * bool(others)
     notes = (*grid.notes, *_notes(grid, above, left, options), *lines_of_units, *table.notes)
-    return replace(table, notes=notes, units=units)
+    return replace(table, notes=notes, units=units, left=[grid.rows[i] for i in sorted(left)])
 
 
 def _stated_units(row: Sequence[str]) -> dict[str, str]:
@@ -258,13 +263,13 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
     """Return every column's name with its unit, and what groups it; and the numbers of the header's rows."""
     width = Counter(len(grid.rows[i]) for i in full).most_common(1)[0][0]
     above = _header_rows(grid, full[0], width)
-    if options.columns:
+    if options.columns and (not above or len(options.columns) == width):
         return [(name, "") for name in options.columns], above
     if not above:
         found = f"no header above '{', '.join(grid.rows[full[0]][:4])}, ...'"
         accepted = f"a header, or --columns with {width} names, such as label,q1_deg,...,x_mm,y_mm,z_mm"
         raise InputError(f"line {grid.lines[full[0]]}", found, accepted)
-    lines = [_uncommented(grid.rows[i], width) for i in above]
+    lines = [_uncommented(grid.rows[i], width, grid.rows[full[0]][0]) for i in above]
     width = max(map(len, lines))
     units: list[str] = []
     signs = {cell.strip("[]()").lower() for cell in lines[-1]} - {""}
@@ -296,11 +301,11 @@ def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
     """Return the rows of text directly above the data that are as wide as these, without a blank line among them."""
     headers: list[int] = []
     for i in reversed(range(max(first - LINES_OF_HEADER, 0), first)):
-        row = _uncommented(grid.rows[i], width)
+        row = _uncommented(grid.rows[i], width, grid.rows[first][0])
         filled = [place for place, cell in enumerate(row, start=1) if cell]
         if (headers and grid.lines[i + 1] - grid.lines[i] > 1) or _stated_units(row):
             break
-        if not any(map(str.isalpha, "".join(row))):
+        if not any(sign.isalpha() or sign == "°" for sign in "".join(row)):
             continue  # a line of dashes
         wide = len(filled) >= width / 2 or (filled[-1] > width / 2 and filled[-1] > 1)
         # merged, above names: Pose, Joint values [deg]
@@ -311,8 +316,11 @@ def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
     return headers
 
 
-def _uncommented(row: Sequence[str], width: int) -> list[str]:
-    """Return a row without the sign that makes it a comment, and as wide as the table if names hold blanks."""
+def _uncommented(row: Sequence[str], width: int, label: str) -> list[str]:
+    """Return a row without the sign that makes it a comment, and as wide as the table if names hold blanks.
+
+    Several names, ``Collection Group Point``, may stand above a ``label``, ``A::Robot::P1``.
+    """
     cells = list(row)
     if len(cells) > width:
         named = BLANK_NAME.findall(" ".join(cells))
@@ -320,8 +328,9 @@ def _uncommented(row: Sequence[str], width: int) -> list[str]:
     if COMMENT.match(cells[0]):
         cells[0] = COMMENT.sub("", cells[0])
         if not cells[0] and len(cells) > width:
-            return cells[1:]
-    return cells
+            cells = cells[1:]
+    excess = len(cells) - width
+    return ["::".join(cells[: excess + 1]), *cells[excess + 1 :]] if excess == label.count("::") else cells
 
 
 # --- columns and their numbers -------------------------------------------------------------------------------------
@@ -356,9 +365,7 @@ def _columns(rows: Sequence[list[str]], heads: Sequence[tuple[str, str]], option
 
 def _fill(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
     """Give every row as many cells as the header; blank ones at the end may be missing or too many."""
-    what = "the header"
-    if options.columns:
-        what = "--columns, the names for every file (or write a header into those without one)"
+    what = "--columns, the names of files without a header" if options.columns else "the header"
     for number, row in enumerate(rows, start=1):
         while len(row) > width and not row[-1]:
             row.pop()

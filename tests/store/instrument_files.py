@@ -417,6 +417,25 @@ STRANGERS: dict[str, Shape] = {
             "// Format: Collection, Group, Target, X, Y, Z\n" + text([], [["A", "Robot", *row] for row in beside(NAMED, POINTS)]),
         ),
     ),
+    "SpatialAnalyzer, three names above A::Robot::P1": many(
+        ("joints.csv", text([HEAD[:7]], beside(NAMED, JOINTS))),
+        (
+            "sa.txt",
+            "// SA export  Units: Millimeters  Frame: A::WORLD\n// Collection Group Point X Y Z\n"
+            + text([], [[f"A::Robot::{row[0]:6}", *row[1:]] for row in beside(NAMED, POINTS)], " "),
+        ),
+    ),
+    "names of the points of two files": many(
+        ("joints.csv", text([HEAD[:7]], beside(NAMED, JOINTS))),
+        ("points.csv", text([], beside(NAMED, POINTS))), columns="label,x_mm,y_mm,z_mm",
+    ),
+    "Excel, a line of signs of degrees below joints alone": excel(
+        {
+            "Achsen": [["Pose", "Achswinkel"], ["", *joint_names("A{}")], ["", *["°"] * 6], *beside(NAMED, JOINTS)],
+            "Punkte": [["Punkt", *"XYZ"], ["", *["mm"] * 3], *beside(NAMED, POINTS)],
+        },
+        sheet="Achsen,Punkte",
+    ),
     "a unit of lengths and one of angles in a comment": one(
         "# 6DoF, length unit mm, angle unit deg\n" + text([BARE], ROWS, "\t"), "raw.txt"
     ),

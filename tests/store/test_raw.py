@@ -186,7 +186,7 @@ def test_a_stated_order_of_a_quaternion_goes_before_the_names_of_its_columns(
 U = ["Point", *HEAD[1:7], "X", "Y", "Z"]
 REFUSED = {
     "no header": (text([], ROWS), [], ["line 1", "no header above 'P1", "--columns with 10 names"]),
-    "too few names": (text([], ROWS), ["--columns", "label,q1_deg"], ["2 cells as in --columns", "for every file"]),
+    "too few names": (text([], ROWS), ["--columns", "label,q1_deg"], ["2 cells as in --columns", "without a header"]),
     "no unit": (text([U], ROWS), [], ["columns without a unit (X, Y, Z)", "--units"]),
     "thousands or decimals": (
         text([HEAD], [["P1", *["1,234"] * 9], ["P2", *["2,345"] * 9]], ";"), [], ["'1,234'", "--decimal"]
