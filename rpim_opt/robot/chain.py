@@ -41,6 +41,7 @@ class RobotSetup:
     base: Array = field(default_factory=partial(np.zeros, 6))  # x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx
     tool: Array = field(default_factory=partial(np.zeros, 6))
     names: tuple[str, ...] = ()  # the file's, of the joints
+    notes: tuple[str, ...] = ()  # on what of the file is left out
 
 
 @dataclass(frozen=True, eq=False)

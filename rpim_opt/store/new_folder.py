@@ -183,6 +183,7 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Interpretation, rows:
             f"Assumed measurement noise (1 sigma): {assumed}. State the instrument's own in [noise] of problem.toml: "
             "noise beyond it is taken for the robot's repeatability."
         )
+    yield from (f"{source.name}, {note}" for note in arm.notes)
     there = "the flange's origin"
     if placed(arm.tool) != placed(np.zeros(6)):  # of a URDF, or a DH table in another convention than the modified one
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"

@@ -81,6 +81,25 @@ def test_a_table_that_does_not_say_its_convention_is_asked_for(tmp_path, monkeyp
     assert tool["tool_rx"] == pytest.approx(ALPHA[-1])
 
 
+def test_a_remark_below_a_table_is_no_row_of_it(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("dh.csv").write_text(sheet() + "\nPayload;12 kg;;;\n")
+    Path("raw.csv").write_text(text([HEAD], ROWS))
+    assert run(monkeypatch, "new", "cell", "--robot", "dh.csv", "--dh", "standard", "--data", "raw.csv") == 0
+    assert "\ndh.csv, line 9 is not a row of the table: 'Payload, 12 kg' ignored.\n" in capsys.readouterr().out
+    assert ro.load("cell").problem.robot.dof == 6
+
+
+@pytest.mark.parametrize(
+    "row", ["7;theta7;8O;none;O", "7;;85;;", "Flange;;85;;", "Joint 7;;;;", "Joint;theta;d;a;alpha"]
+)
+def test_a_row_of_a_sheet_is_not_lost(tmp_path: Path, row: str) -> None:
+    path = tmp_path / "dh.csv"
+    path.write_text(f"{sheet()}{row}\n")
+    with pytest.raises(ro.InputError, match=f"'{row.split(';')[0]}.*accepted: one row per joint"):
+        read_sheet(path, "standard")
+
+
 @pytest.mark.parametrize(
     ("header", "said"),
     [

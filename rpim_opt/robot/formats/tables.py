@@ -18,7 +18,7 @@ from rpim_opt.basics.exceptions import InputError, of_file, pick
 from rpim_opt.basics.files import read_json, read_toml, write_json, write_text
 from rpim_opt.basics.layout import PART_OF_PI, read_table
 from rpim_opt.basics.schema import Angle, Length, Mass, Misfit, Table, validate
-from rpim_opt.basics.tables import csv_text
+from rpim_opt.basics.tables import csv_text, is_numeral
 from rpim_opt.basics.units import UNITS, accepted_units, display, split
 from rpim_opt.robot.chain import Chain, RobotSetup, describe, joint_values, standard_table, without_beta
 from rpim_opt.robot.kinematics import frame_numbers, numeric_link
@@ -195,9 +195,10 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
         standard   Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta)
     """
     raw = read_table(path, turned=lambda grid: {"alpha", "a", "d"} <= {_stem(row[0])[0] for row in grid.rows})
-    lost = next((note for note in raw.notes if "is not a row of the table" in note), "")
-    if lost:
-        raise InputError("the table", lost.rstrip("."), "one row per joint")
+    for row in raw.left:  # a remark below the table has few cells, and no numbers alone
+        cells = [cell for cell in row if cell]
+        if len(cells) > len(raw.columns) / 2 or any(map(is_numeral, cells)) or JOINT_NAME.fullmatch(cells[0]):
+            raise InputError("the table", f"'{', '.join(cells)[:60]}', no row of numbers", "one row per joint")
     columns = _sheet_columns(raw.columns)
     conventions = {convention, *(cell.lower() for cell in columns.pop("convention", []))} - {""}
     if any(INDEX_BEFORE.search(name) for name in raw.columns):
@@ -210,11 +211,10 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
         raise InputError("the convention of the table", " and ".join(sorted(known)) or "not stated", accepted)
     joints = [_joint(dict(zip(columns, cells, strict=True))) for cells in zip(*columns.values(), strict=True)]
     robot = _robot({"name": path.stem, "joint": joints}, path)
-    if known == {"modified"}:
-        return RobotSetup(robot)
-    if robot.gravity.masses:
+    if robot.gravity.masses and known != {"modified"}:
         raise InputError("the table", "masses of links in the frames of another convention", "--dh modified")
-    return _from_standard(robot)
+    arm = RobotSetup(robot) if known == {"modified"} else _from_standard(robot)
+    return replace(arm, notes=tuple(note for note in raw.notes if "is not a row of the table" in note))
 
 
 def _sheet_columns(header: Mapping[str, Sequence[Any]]) -> dict[str, list[str]]:
