@@ -63,6 +63,25 @@ def test_an_unknown_angle_of_a_sheet_is_offered_in_its_own_unit(tmp_path: Path) 
         read_sheet(path, "standard")
 
 
+@pytest.mark.parametrize(
+    ("cells", "turn"),
+    [
+        ("1.5708,0,-1.5708", "1.5708 is pi/2 rad"),
+        ("0,-3.14,1.57", "3.1416 is pi rad"),
+        ("90,0,1.5708", ""),
+        ("1.6", ""),
+    ],
+)
+def test_radians_in_a_column_of_degrees_are_named(tmp_path: Path, cells: str, turn: str) -> None:
+    path = tmp_path / "dh.csv"
+    path.write_text("alpha_deg,d_mm\n" + "".join(f"{cell},100\n" for cell in cells.split(",")))
+    if not turn:
+        assert len(read_sheet(path, "modified").robot.mdh) == len(cells.split(","))
+        return
+    with pytest.raises(ro.InputError, match=rf"dh.csv, column alpha_deg: found .* \({turn}: name the column alpha_rad"):
+        read_sheet(path, "modified")
+
+
 def test_a_table_that_does_not_say_its_convention_is_asked_for(tmp_path, monkeypatch, capsys) -> None:
     monkeypatch.chdir(tmp_path)
     Path("dh.csv").write_text(sheet())

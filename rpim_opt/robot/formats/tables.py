@@ -49,6 +49,8 @@ JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")  # 
 ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*°?", re.IGNORECASE)
 """A joint's variable with its offset, ``q2 - 90``."""
 ANGLES = tuple(name for name, dimension in MDH_DIMENSION.items() if dimension == "angle")
+TURNS, NEARLY = {np.pi / 2: "pi/2", np.pi: "pi"}, 0.002
+"""Angles [rad] of most tables, and what three digits of them miss at most."""
 JOINT_NAME = re.compile(r"(?:joint|axis|link|achse|gelenk)[\s_]*\d+", re.IGNORECASE)  # in a cell
 WITHOUT_COLUMN = {"coupling": "a coupling of joints", "mounting": "a mounting elsewhere", "payload": "a payload"}
 """What a table with one row per joint has no place for."""
@@ -122,6 +124,12 @@ def gravity_with(
 def _robot(content: dict[str, Any], path: Path) -> Robot:
     """Return the robot that the keys of a ``robot.toml`` describe, whatever file they come from."""
     table = validate(_RobotTable, content, path)
+    for column in ANGLES:
+        stated = [value for joint in content["joint"] if (value := joint.get(f"{column}_deg"))]
+        turns = [turn for value in stated for turn in TURNS if abs(abs(value) - turn) < NEARLY]
+        if stated and len(turns) == len(stated):
+            accepted = f"degrees ({turns[0]:.5g} is {TURNS[turns[0]]} rad: name the column {column}_rad)"
+            raise InputError(f"column {column}_deg", f"{stated[0]:g}", accepted)
     dof = len(table.joint)
     coupling = np.eye(dof).tolist() if table.coupling is None else table.coupling
     if len(coupling) != dof or {len(row) for row in coupling} - {len(coupling[0])} or not 0 < len(coupling[0]) <= dof:
