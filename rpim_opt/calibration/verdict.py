@@ -23,7 +23,17 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
 from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.diagnosis import ANGULAR, NOISY, NOTICED, REACH, SLIGHT, decimals_of, first
+from rpim_opt.problem.diagnosis import (
+    ANGULAR,
+    NOISY,
+    NOTICED,
+    REACH,
+    SLIGHT,
+    decimals_of,
+    first,
+    hardly_moved,
+    moved_one_by_one,
+)
 from rpim_opt.problem.misreadings import Better, better_interpretation, sibling
 from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
@@ -80,7 +90,7 @@ class Verdict:
     Exit codes, exports, compensation and the report follow it. ``reasons`` say why it is not delivered, a sentence
     each; empty where it is. ``caution`` is the condition that it depends on and that uncertainties do not contain:
     signs and zeros of joints that were estimated, constraints that the data contradict, a stated frame whose error
-    would look like a large deviation of the robot; empty where there is none.
+    would look like a large deviation of the robot, joints that hardly moved; empty where there is none.
 
     >>> import rpim_opt as ro
     >>> print(ro.calibrate(ro.load("position").problem, "tikhonov", 1.0, max_iterations=1).verdict)
@@ -132,7 +142,8 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     limited. Where the formulation limits the fit, other reasons than held-out rows follow from that, and are not named.
     """
     mapping = result.mapping.caution if result.mapping else ""
-    caution = " ".join(filter(None, [mapping, result.contradiction, ambiguous_deviation(result)]))
+    conditions = (mapping, result.contradiction, ambiguous_deviation(result), *_little_motion(result))
+    caution = " ".join(filter(None, conditions))
     limited = tuple(text for text in causes if LIMITED in text)
     if limited:
         return Verdict((*limited, *_worse(result)), caution)
@@ -166,6 +177,27 @@ def ambiguous_deviation(result: Outcome) -> str:
         f"distinguish from an error of the stated {joined(stated)}: check it. If it is wrong, this robot is right only "
         "together with it."
     )
+
+
+def _little_motion(result: Outcome) -> Iterator[str]:
+    """Say which joints of a robot that was identified hardly moved, or that they were moved one by one."""
+    p = result.problem.parameters
+    if not (p.identified & ~p.of_frames).any():
+        return
+    still = [text for name, arm in result.problem.arms.items() for text in hardly_moved(arm, result.ranges[name])]
+    if still:
+        yield (
+            f"Too little motion: {joined(still)}. The result holds only near the values that were measured there; "
+            "before using others, measure configurations in which these joints move."
+        )
+    problem = result.problem.sample()
+    if not result.record.earlier and any(
+        moved_one_by_one(arm, diagnosis.all_q(problem.alone(name).data)) for name, arm in problem.arms.items()
+    ):
+        yield (
+            "In nearly all rows one joint alone differs from a common configuration, so that the data do not show how "
+            "joints act together: measure configurations in which all joints differ."
+        )
 
 
 def _like_a_scale(result: Outcome) -> str:

@@ -16,7 +16,6 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.calibration.verdict import REPEATABILITY, Verdict, scaled_by_board
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.problem.diagnosis import all_q, hardly_moved, moved_one_by_one
 from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
@@ -172,37 +171,22 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
 
 
 def underdetermined(result: Outcome) -> list[str]:
-    """Return sentences on joints that hardly moved, and on frames of which the data determine a combination alone."""
+    """Return a sentence on frames of which the data determine a combination alone."""
     p = result.problem.parameters
-    lines = []
-    still = [text for name, arm in result.problem.arms.items() for text in hardly_moved(arm, result.ranges[name])]
-    if still and (p.identified & ~p.of_frames).any():
-        lines.append(
-            f"Too little motion: {joined(still)}. The result holds only near the values that were measured there; "
-            "before using others, measure configurations in which these joints move."
-        )
-    if any(
-        moved_one_by_one(arm, all_q(result.problem.sample().alone(name).data))
-        for name, arm in result.problem.arms.items()
-    ):
-        lines.append(
-            "In nearly all rows one joint alone differs from a common configuration, so that the data do not show how "
-            "joints act together: measure configurations in which all joints differ."
-        )
     covariance = result.known_covariance
     if covariance is None:
-        return lines
+        return []
     std = np.sqrt(np.diag(covariance))
     placed = [own_name(name).startswith((f"{BASE}_", "tool_")) for name in p.free.names]
     vague = np.flatnonzero(placed & np.isfinite(std) & (std > NOMINAL_ERROR))
     correlation = covariance[np.ix_(vague, vague)] / np.outer(std[vague], std[vague]) - np.eye(len(vague))
     names = [p.free.names[k] for k, each in zip(vague, correlation, strict=True) if np.abs(each).max() > REDUNDANT]
-    if names:
-        lines.append(
-            f"{joined(names)} are redundant: the data determine a combination; either value and its uncertainty rest "
-            f'on stated start and scale. State one: [prior] known = ["{names[-1]} = ... +- ..."].'
-        )
-    return lines
+    if not names:
+        return []
+    return [
+        f"{joined(names)} are redundant: the data determine a combination; either value and its uncertainty rest "
+        f'on stated start and scale. State one: [prior] known = ["{names[-1]} = ... +- ..."].'
+    ]
 
 
 def _outlying(result: Outcome, advised: bool) -> list[str]:

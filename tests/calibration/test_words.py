@@ -116,7 +116,7 @@ def test_frames_of_which_the_data_determine_a_combination_are_named() -> None:
     assert words.underdetermined(RESULT) == words.underdetermined(ro.calibrate(ro.load("plane").problem)) == []
 
 
-def test_joints_that_were_moved_one_by_one_are_named() -> None:
+def test_joints_that_hardly_moved_or_one_by_one_are_a_condition() -> None:
     """From the middle of the ranges, each joint in turn; beyond that the robot is 1.6 to 3 times as wrong."""
     problem = ro.load("position").problem
     (block,) = problem.data.blocks
@@ -124,9 +124,11 @@ def test_joints_that_were_moved_one_by_one_are_named() -> None:
     rows = np.arange(len(q))
     q[rows, 0, rows % 6] = block.q[rows, 0, rows % 6]
     moved = problem.on(replace(problem.data, blocks=(replace(block, q=q),)))
-    y = moved.modelled(np.zeros(len(problem.parameters.free)))[0]
-    said = words.underdetermined(ro.calibrate(moved.on(replace(moved.data, blocks=(replace(block, q=q, y=y),)))))
-    assert any("one joint alone differs from a common configuration" in line for line in said)
+    y = moved.modelled(np.zeros(len(problem.parameters.free)))[0] + 1e-5 * np.random.default_rng(0).normal(size=(40, 3))
+    caution = ro.calibrate(moved.on(replace(moved.data, blocks=(replace(block, q=q, y=y),)))).verdict.caution
+    assert "one joint alone differs from a common configuration" in caution
+    still = ro.calibrate(ro.load("rank_deficient").problem).verdict
+    assert str(still).startswith("Delivered under a condition. Too little motion: joint 6 moves only 0.00 deg.")
 
 
 def test_errors_before_and_after_are_in_millimetres() -> None:
