@@ -10,6 +10,7 @@ from itertools import chain, combinations, combinations_with_replacement, pairwi
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from scipy.special import bdtrc, fdtrc
 
 from rpim_opt.basics.arrays import TINY, Array, rms
@@ -62,6 +63,8 @@ ANOTHER = 0.01  # joint movement [rad, m] after which no point is measured again
 FILLED = 1e-3  # a point that is at least so far from the one before [m] is another one
 COPIES = 0.2  # part of the rows that may repeat others
 MOST_ROUNDS = 20  # of fitting one joint's values
+LOADS, SINGULAR = 0.6, 1e-9
+"""What two loads leave of the residuals at most; part of the squares below which columns are the same."""
 COMPUTED = "were they computed, not measured? Leave them out ([exclude])."
 MOSTLY = 2 / 3  # share of the rows from one to another that is of one kind, for a change to have come there
 TWO_KINDS, STARTS = 0.4, 30
@@ -821,7 +824,8 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
         said = [_said_of_kinds(problem, rows, part)] if kinds else ()
         noise = _uneven_noise(problem, x) if acceptable == 1 else ()  # else errors are too large for noise
         backlash = two_positions(problem, x, min(limit, part / MOVED) if kinds else limit)
-        yield from first(backlash, said, noise, scattered_rows(problem, x))
+        loads = () if problem.touches else two_loads(problem, x)
+        yield from first(backlash, said, noise, loads, scattered_rows(problem, x))
 
 
 def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[str]:
@@ -1071,28 +1075,15 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
     The parameters are fitted beside, with their prior. Random errors leave 60 % of the residuals, as their signs are
     fitted then and not their sizes, and much less where there are fewer than three equations a parameter.
     """
-    alone = problem.with_repeatability(None)
-    model, free, rows = alone.linearize(x), problem.parameters.free, alone.owners
-    r = model.b - model.A @ (x / free.scale)
-    if len(r) < 3 * len(x) or not r.any():
+    model, free = problem.with_repeatability(None).linearize(x), problem.parameters.free
+    if len(model.b) < 3 * len(x):
         return
-    without = _without_parameters(model)
     joints = [(i, free.names.index(name)) for i, name in enumerate(_zeros(problem.robot), 1) if name in free.names]
     joints = [(i, k) for i, k in joints if model.A[:, k].any()]
     best, alone, said = most, np.inf, ""
     for some in [*combinations(joints, 1), *combinations(joints, 2)]:
         numbers = [k for _, k in some]
-        A = columns = model.A[:, numbers]
-        sides = np.array(list(product((-1.0, 1.0), repeat=len(some))))
-        step, target = np.linalg.norm(r) / np.linalg.norm(A, axis=0), r
-        for _ in range(MOST_ROUNDS):
-            errors = [np.bincount(rows, (target - A @ (side * step)) ** 2) for side in sides]
-            before, columns = columns, A * sides[np.argmin(errors, axis=0)][rows]
-            if np.array_equal(columns, before):
-                break
-            step = np.linalg.lstsq(without(columns), without(r[:, None])[:, 0], rcond=None)[0]
-            target = without((r - columns @ step)[:, None])[: len(r), 0] + columns @ step
-        left = float(np.linalg.norm(target - columns @ step) / np.linalg.norm(r))
+        left, step, _ = _either_side(model, x, problem.owners, [model.A[:, [k]] for k in numbers])
         if len(some) == 1:
             alone = min(alone, left)
         apart = 2e3 * np.abs(step) * free.scale[numbers]
@@ -1107,6 +1098,60 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
             f"{said}: one of two positions in every row explains the residuals (that leaves {100 * best:.0f} %). "
             "Approach all configurations from one side, or state the directions of approach (columns approach1, ...)."
         )
+
+
+def two_loads(problem: CalibrationProblem, x: Array) -> Iterator[str]:
+    """Report rows whose residuals at x (n,) the deflection of joints under one of two loads explains, to the noise."""
+    every = np.array(problem.parameters.names)
+    p, bends = problem.parameters, np.char.startswith(every, "compliance")
+    model, whole = problem.with_repeatability(None).linearize(x), problem.identifying(p.identified | bends)
+    there = np.zeros(len(whole.parameters.free))
+    there[p.identified[whole.parameters.identified]] = x
+    A = whole.with_repeatability(None).linearize(there).A[:, bends[whole.parameters.identified]]
+    A = A[:, A.any(axis=0)]
+    if len(model.b) < 3 * len(x) or not A.size:
+        return
+    left, _, side = _either_side(model, x, problem.owners, [A])
+    rows = np.flatnonzero(side[:, 0] == (1 if side.sum() <= 0 else -1))
+    whole_size = rms(model.b - model.A @ (x / p.free.scale))
+    if left < LOADS and left * whole_size < NOTICED and len(rows) >= FEWEST:
+        yield (
+            f"{_rows(problem.data, rows, 'fits', 'fit')} another load at the flange (one of two loads in every row "
+            f"explains the residuals; that leaves {100 * left:.0f} %): was a tool or a workpiece attached? State "
+            "payload_kg of every row and add `compliance?` to `identify`, or calibrate the two groups separately."
+        )
+
+
+def _either_side(
+    model: LinearModel, x: Array, rows: np.ndarray, groups: Sequence[Array]
+) -> tuple[float, Array, np.ndarray]:
+    """Return what part of the residuals at x (n,) groups of columns (m, k) leave that count +1 or -1 in every row.
+
+    Beside it their coefficients, and the sides (N, groups). They start with what changes residuals most.
+    """
+    r: Array = model.b - model.A @ (x / model.parameters.scale)
+    without = _without_parameters(model)
+    steps = []
+    for G in groups:
+        moments = np.column_stack([np.bincount(rows, column * r) for column in G.T])
+        size = G.T @ G
+        c = scipy.linalg.eigh(moments.T @ moments, size + SINGULAR * np.trace(size) * np.eye(len(size)))[1][:, -1]
+        steps.append(c * np.linalg.norm(r) / max(np.linalg.norm(G @ c), TINY))
+    sides = np.array(list(product((-1.0, 1.0), repeat=len(groups))))
+    target, columns = r, np.hstack(groups)
+    chosen, rest = sides[:1], without(r[:, None])[:, 0]
+    for _ in range(MOST_ROUNDS):
+        moved = np.column_stack([G @ step for G, step in zip(groups, steps, strict=True)])
+        errors = [np.bincount(rows, (target - moved @ side) ** 2) for side in sides]
+        before, chosen = columns, sides[np.argmin(errors, axis=0)]
+        columns = np.hstack([G * chosen[rows, [i]][:, None] for i, G in enumerate(groups)])
+        if np.array_equal(columns, before):
+            break
+        step = np.linalg.lstsq(without(columns), rest, rcond=None)[0]
+        target = without((r - columns @ step)[:, None])[: len(r), 0] + columns @ step
+        steps = np.split(step, np.cumsum([G.shape[1] for G in groups])[:-1])
+    left = float(np.linalg.norm(target - columns @ np.concatenate(steps)) / max(np.linalg.norm(r), TINY))
+    return left, np.concatenate(steps), chosen
 
 
 def _zeros(robot: Robot) -> list[str]:
