@@ -1131,7 +1131,7 @@ def _either_side(
     """
     r: Array = model.b - model.A @ (x / model.parameters.scale)
     without = _without_parameters(model)
-    steps = []
+    steps: list[Array] = []
     for G in groups:
         moments = np.column_stack([np.bincount(rows, column * r) for column in G.T])
         size = G.T @ G
@@ -1150,8 +1150,8 @@ def _either_side(
         step = np.linalg.lstsq(without(columns), rest, rcond=None)[0]
         target = without((r - columns @ step)[:, None])[: len(r), 0] + columns @ step
         steps = np.split(step, np.cumsum([G.shape[1] for G in groups])[:-1])
-    left = float(np.linalg.norm(target - columns @ np.concatenate(steps)) / max(np.linalg.norm(r), TINY))
-    return left, np.concatenate(steps), chosen
+    found = np.concatenate(steps, dtype=float)
+    return float(np.linalg.norm(target - columns @ found) / max(np.linalg.norm(r), TINY)), found, chosen
 
 
 def _zeros(robot: Robot) -> list[str]:
