@@ -1131,7 +1131,7 @@ def _either_side(
     """
     r: Array = model.b - model.A @ (x / model.parameters.scale)
     without = _without_parameters(model)
-    steps: list[Array] = []
+    steps: Any = []
     for G in groups:
         moments = np.column_stack([np.bincount(rows, column * r) for column in G.T])
         size = G.T @ G
