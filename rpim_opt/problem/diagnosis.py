@@ -615,13 +615,17 @@ def _other_place(points: Points, first: Fit, second: Fit, sessions: bool) -> tup
     reflectors = float(np.linalg.norm(second.tools - first.tools, axis=1).max())
     if points.lengths:
         far = float(np.linalg.norm(second.base[:3, 3] - first.base[:3, 3]))
-        other, what = "anchor", "the anchor or the robot's base moved; calibrate the two parts separately"
+        remedy = "name the anchor of every row in a column `fixture` of the raw table (rpim-opt new)"
+        other, what = "anchor", f"the anchor or the robot's base moved; {remedy}"
         joint, places = 1, np.zeros((0, 2, 3))
     else:  # the second part's points in the robot's frame, by either base
         backs: Any = np.linalg.inv(np.stack([first.base, second.base]))
         joint, places = 1, transformed(backs, second.modelled[:, None])
         far = float(np.linalg.norm(places[:, 1] - places[:, 0], axis=1).mean())
-        remedy = "calibrate one part, and add the other to its result with `update --reset 'base_*'`"
+        remedy = (
+            "name both parts in a column `session` of the raw table (rpim-opt new registers each), or calibrate one "
+        )
+        remedy += "and add the other to its result with `update --reset 'base_*'`"
         if sessions:  # of one place, unless they are said to be apart
             remedy = "if it did between sessions, identify `session_*` in place of `base_*`, "
             remedy += "with session_mm = 1000 and session_mrad = 1000 in [scale]"

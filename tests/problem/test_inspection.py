@@ -54,8 +54,27 @@ def test_the_row_from_which_on_the_base_stood_elsewhere_is_named() -> None:
     """Not where all rows scatter, and no part of the table fits better than the whole."""
     (said,) = other_places(changed("position", y=lambda y: y + 0.05 * (np.arange(len(y)) >= 20)[:, None]))
     assert said.startswith("from about row c20 on the points fit another base")
+    assert "name both parts in a column `session` of the raw table (rpim-opt new registers each), or" in said
     scattered = changed("position", y=lambda y: y + np.random.default_rng(1).normal(0.0, 0.05, y.shape))
     assert list(other_places(scattered)) == []
+
+
+@pytest.mark.parametrize("moved", [True, False])
+@pytest.mark.parametrize("name", ["irb120", "ur10e"])
+def test_the_row_from_which_on_a_wire_hung_elsewhere_is_named(name: str, moved: bool) -> None:
+    """With the errors of a robot, beside which few errors of one coordinate are small by chance."""
+    rng, count = np.random.default_rng(0), 60
+    robot = ro.read_robot(name)
+    mdh = robot.mdh + rng.normal(size=robot.mdh.shape) * [5e-4, 5e-4, 1e-3, 5e-4, 0.0]
+    q = rng.uniform(-2, 2, (count, robot.dof))
+    T = ro.robot.forward_kinematics(replace(robot, mdh=mdh), q)
+    anchor = np.array([1.5, -0.5, 0.3]) + np.outer(np.arange(count) >= count / 2, [-0.6, 0.6, 0.5]) * moved
+    lengths = np.linalg.norm(T[:, :3, 3] + T[:, :3, :3] @ [0.03, -0.04, 0.07] - anchor, axis=1)
+    lengths += rng.normal(0.0, 5e-5, count)
+    said = list(other_places(ro.problem_from(robot, ro.Dataset.of(q, lengths[:, None], 5e-5, measurement="cable"))))
+    remedy = "name the anchor of every row in a column `fixture` of the raw table"
+    assert [text.startswith("from about row 31 on the points fit another anchor") for text in said] == [True] * moved
+    assert all(remedy in text for text in said)
 
 
 def test_rows_that_stand_out_are_named() -> None:

@@ -34,6 +34,7 @@ LARGEST_BATCH = 4_000_000  # entries of the Jacobians in memory at once
 DRAWS, BEST_DRAWS, LEAST_SHARE = 400, 20, 1 / 3
 """Few rows that are fitted to find those that agree, how many of these are refined, and the share that has to agree."""
 FAR = 5.0  # medians of the errors from which on a row is in question
+ONE_COORDINATE = 2.3  # medians of normal errors with three coordinates over those with one, in standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -252,8 +253,9 @@ def agreeing(points: Points) -> tuple[np.ndarray, Fit]:
         sets = nearest[np.argsort(squares)[:BEST_DRAWS]]
     own = np.isin(np.arange(N), sets[0])
     fits = _fits_of_all(points, sets[:1])
+    far = FAR * ONE_COORDINATE**points.lengths
     for _ in range(STEPS):
-        before, own = own, fits.error[0] < FAR * np.median(fits.error[0, own])
+        before, own = own, fits.error[0] < far * np.median(fits.error[0, own])
         if np.array_equal(own, before):
             break
         fits = _fits_of_all(points, np.flatnonzero(own)[None])
