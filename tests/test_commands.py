@@ -170,11 +170,12 @@ def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cel
     export = ("export", "arm/results", "--urdf", str(cell / "arm.urdf"), "--out")
     capsys.readouterr()
     assert run(monkeypatch, *export, "corrected.urdf", "--tip-measured") == 0
-    assert "(option tip-measured) to the identified reflector" in Path("corrected.urdf").read_text()
+    assert " mm to the identified reflector" in Path("corrected.urdf").read_text()
     stated = re.search(r"\(k = 2.*: smr ([\d.]+) mm and ([\d.]+) mrad", capsys.readouterr().out)
     assert stated
     stated_place, stated_turn = map(float, stated.groups())
     assert run(monkeypatch, *export, "behind.urdf") == 0
+    assert "option tip-measured (tip_measured=True) moves it there" in Path("behind.urdf").read_text()
     assert "Positions of one reflector determine only part of its pose" in capsys.readouterr().out
     assert run(monkeypatch, "report", "arm/results", "--data", str(cell / "later.csv")) == 0
     page = Path("arm/results/report.html").read_text(encoding="utf-8")
@@ -519,7 +520,7 @@ def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path
     outs = ["--mdh", str(tmp_path / "again.json"), "--out", str(tmp_path / "both")]
     sources = ["--urdf", str(cell / "arm.urdf"), "--ur-kinematics", str(tmp_path / "ros.yaml")]
     assert run(monkeypatch, "export", str(made / "results"), *sources, *outs) == 2  # of another robot
-    assert "a robot identified from this file's nominal parameters" in capsys.readouterr().err
+    assert "begin with rpim-opt new --robot " in capsys.readouterr().err
     assert not (tmp_path / "again.json").exists()
     assert not (tmp_path / "both").exists()
 

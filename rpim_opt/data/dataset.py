@@ -292,6 +292,7 @@ class Dataset(Tabled):
             of_q = "(N, dof)" if points == 1 else f"(N, {points}, dof)"
             joints = q[:, 0] if q.ndim == 3 and q.shape[1] == 1 else q
             accepted = f"{of_q} joint values and (N, {c}) measured values: {', '.join(measurement.columns)}"
+            accepted += '; of poses, state measurement="pose"' if y.shape[1:] in ((4, 4), (7,)) else ""
             raise InputError("q and y", f"shapes {joints.shape} and {y.shape}", accepted)
         rows = np.arange(N)
         covariance = _covariances(sigma, N, len(measurement.components))

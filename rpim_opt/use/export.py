@@ -350,12 +350,12 @@ def _write_urdf(
     if tool is not None:
         moved = 1e3 * np.linalg.norm(tool[:3] - own.tool[:3])
         notes.append(
-            f"URDF: {tip} moved by {moved:.3g} mm (--tip-measured) to the identified reflector, {placed(tool)} in the "
-            f"DH table's flange frame: whatever refers to {tip} moves with it."
+            f"URDF: {tip} moved by {moved:.3g} mm to the identified reflector, {placed(tool)} in the DH table's flange "
+            f"frame: whatever refers to {tip} moves with it."
         )
     elif of_tool:
         at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
-        there = f"in its frame the reflector is at {at}; where the reflector is the tip, --tip-measured moves it there"
+        there = f"in its frame the reflector is at {at}; --tip-measured (tip_measured=True) moves it there"
         notes.append(f"URDF: {tip} keeps its pose from the file; {there}.")
     notes += _tip_uncertainty(result, tip or "the tip link", own.tool if tool is None else None, marker, robot)
     return notes + write_urdf(source, arm.robot, target, root, tip, base, tool)

@@ -65,6 +65,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "the second point of another board": (lambda: on_board({"point": ["3", "33"]}, BOARD), "row 2, column point"),
     "joint values that are no numbers": (lambda: ro.Dataset.of(Q * np.nan, np.zeros((4, 3)), 1e-4), "finite numbers"),
+    "transforms as positions": (lambda: ro.Dataset.of(Q, np.zeros((4, 4, 4)), 1e-4), 'state measurement="pose"'),
     "measured values in two columns": (lambda: ro.Dataset.of(Q, np.zeros((4, 2)), 1e-4), "(N, 3) measured values"),
     "torques of other rows": (lambda: ro.Dataset.of(Q, np.zeros((4, 3)), 1e-4, torque=Q[:2]), "shape (2, 6)"),
     "a payload too many": (lambda: ro.Dataset.of(Q, np.zeros((4, 3)), 1e-4, payload=np.ones(5)), "shape (4,)"),

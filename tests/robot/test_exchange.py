@@ -843,7 +843,9 @@ def test_a_problem_may_name_a_urdf(tmp_path: Path) -> None:
     frames = dict(zip(stated.names, stated.nominal, strict=True))
     assert (frames["tool_x"], frames["tool_y"], frames["base_z"], frames["base_x"]) == (1e-3, 0.0, 2e-3, 0.0)
     (tmp_path / "problem.toml").write_text(PROBLEM.replace("urdf_tip", "# "))
-    with pytest.raises(ro.InputError, match=r"urdf_tip, also a key in problem\.toml"):
+    with pytest.raises(
+        ro.InputError, match=r"urdf_tip, also a key in problem\.toml, or ro\.read_urdf\(file, tip=link\)"
+    ):
         ro.load(tmp_path)
     ro.robot.write_robot(arm.robot, tmp_path / "arm.json")
     (tmp_path / "problem.toml").write_text(PROBLEM.replace("arm.urdf", "arm.json"))

@@ -470,7 +470,7 @@ class _Urdf:
 def _only(links: Sequence[str], where: str, accepted: str, which: str) -> str:
     """Return the only one of links; of several one has to be named."""
     if len(links) > 1:
-        accepted = f"{accepted}: --urdf-{which}, also a key in problem.toml, or the argument {which}"
+        accepted = f"{accepted}: --urdf-{which}, also a key in problem.toml, or ro.read_urdf(file, {which}=link)"
         raise InputError(where, ", ".join(links), accepted)
     return links[0]
 
