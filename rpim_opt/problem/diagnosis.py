@@ -47,7 +47,7 @@ FEWEST = 6  # rows on either side of a change, or of which copies are told
 LINEAR, EXACT = 13, 1e-5
 """Coefficients of a coordinate by position and rotation of the flange, and what no measurement comes up to [m]."""
 BEYOND_REACH = 3.0
-"""Lengths of the arm by which a position may be away from the others, if they are not so far themselves."""
+"""Lengths of the arm by which a position may be away from the others."""
 MOST_LOST = 0.25  # part of the rows that may be so by lost decimal points: more are of another frame or quantity
 UNRELATED = 0.25  # part of the spread of positions that a fit leaves where joint values do not explain them
 FOLDED = 0.1  # part of its largest value below which the smallest one of a column without signs is near zero
@@ -186,7 +186,7 @@ def rows_without_values(data: Dataset, arms: Mapping[str, Robot]) -> Iterator[st
             )
         reach = arm_length(arms[block.robot], [block])
         away = np.linalg.norm(y - np.median(y, axis=0), axis=1)
-        lost = block.row[away > BEYOND_REACH * max(reach, float(np.median(away)))]
+        lost = block.row[away > BEYOND_REACH * reach]
         if 0 < len(lost) < MOST_LOST * len(y):
             yield (
                 f"{_rows(data, lost, 'is', 'are')} farther from the others than the arm is long: was a decimal point "

@@ -146,7 +146,7 @@ def _readings(points: Points) -> list[Misreading]:
             remedy = f"multiply column distance by {factor:g} or name its unit"
             readings.append(_scaled(f"measured lengths {unit}", remedy, factor))
         return [*readings, _scaled("measured lengths that count down", "change the sign of column distance", -1.0)]
-    return [*readings, *_of_positions(), *(_of_poses() if points.turns is not None else ())]
+    return [*readings, *_of_positions(points), *(_of_poses() if points.turns is not None else ())]
 
 
 def _of_joints(robot: Robot) -> Iterator[Misreading]:
@@ -173,6 +173,11 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
         yield _joints(f"{joint} reversed", f"write sign = {sign} for {joint} in robot.toml", flipped)
         what = f"{joint} standing still in all rows"
         yield _joints(what, "check its brake and its column", eye - np.outer(eye[i], eye[i]))
+        if turning[i]:
+            kinds = ["prismatic" if k == robot.leading[i] else kind for k, kind in enumerate(robot.joint_types)]
+            remedy = f'write type = "prismatic" for it in robot.toml, and name its column q{i + 1}_mm'
+            sliding = replace(robot, joint_types=tuple(kinds))
+            yield _with_robot(f"{joint} prismatic and its values mm", remedy, sliding, DEGREES_PER_MM ** -eye[i])
     for i, last in enumerate(map(robot.joint, range(robot.dof - 2)), start=1):
         remedy = f"put it on the last link, or describe the robot up to joint {last}"
         before = np.diag(np.arange(robot.dof) < i).astype(float)
@@ -212,12 +217,22 @@ def _joints(what: str, remedy: str, M: Array) -> Misreading:
     return Misreading(what, remedy, lambda points: replace(points, q=points.q @ M.T))
 
 
-def _of_positions() -> Iterator[Misreading]:
-    """Yield readings with other measured positions: units of all columns or one, handedness."""
+def _with_robot(what: str, remedy: str, robot: Robot, times: Array | float = 1.0) -> Misreading:
+    return Misreading(what, remedy, lambda points: replace(points, robot=robot, q=points.q * times))
+
+
+def _of_positions(points: Points) -> Iterator[Misreading]:
+    """Yield readings with other measured positions, or of another size: units of all columns or one, handedness."""
+    width = replace(points, y=forward_kinematics(points.robot, points.q)[:, :3, 3]).extent
+    wrong_robot = abs(np.log(width)) > abs(np.log(points.extent))  # is farther from the size of robots, a metre
     for factor, (unit, remedy) in LENGTHS.items():
-        yield _scaled(
-            f"measured lengths {unit}", f"{remedy}; or correct the robot's file, if its unit is wrong", factor
-        )
+        if wrong_robot and "thousand" in unit:
+            robot = replace(points.robot, mdh=points.robot.mdh / [1, factor, 1, factor, 1])
+            remedy = f"correct the unit of the robot's file; or {remedy}, if their unit is wrong"
+            yield _with_robot(f"robot lengths {LENGTHS[1 / factor][0]}", remedy, robot)
+        else:
+            remedy += "; or correct the robot's file, if its unit is wrong"
+            yield _scaled(f"measured lengths {unit}", remedy, factor)
         for axis, of_axis in zip("xyz", np.eye(3), strict=True):
             remedy = f"multiply column {axis} by {factor:g} or name its unit"
             yield _scaled(f"column {axis} {unit}", remedy, 1 + (factor - 1) * of_axis)
@@ -445,7 +460,7 @@ def _other_robots(points: Points) -> Iterator[Misreading]:
     others += [(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', of) for name, of in ready.items()]
     for what, remedy, other in others:
         if (other.joint_types, other.dof) == (robot.joint_types, robot.dof):
-            yield Misreading(what, remedy, lambda points, other=other: replace(points, robot=other))
+            yield _with_robot(what, remedy, other)
 
 
 # Which of these fits
@@ -563,7 +578,7 @@ def _mistakes(points: Points, stated: float) -> tuple[list[Misreading], float]:
     chain, best = _chain(points, stated, readings, enough, MISTAKES[points.by_camera])
     if stated > WRONG and not points.by_camera and best >= enough:
         # another unit of lengths alone may be no better, as that of angles beside it is wrong, too
-        units = [i for i, each in enumerate(readings) if each.what.startswith("measured lengths a thousand")]
+        units = [i for i, each in enumerate(readings) if " lengths a thousand" in each.what]
         for i in dict.fromkeys([*units, *np.argsort(_tried(points, readings))[:12].tolist()]):
             changed = readings[i].change(points)
             others = [each for each in _readings(changed) if each.what != readings[i].what]

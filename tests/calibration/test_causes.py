@@ -963,6 +963,29 @@ def test_a_stroke_in_inches_is_named() -> None:
     assert "values of linear joints in inches" in better_interpretation(joints(lambda q: q * inches)(problem)).sentence
 
 
+def test_a_quill_that_is_not_declared_prismatic_is_named() -> None:
+    """Its millimetres are read as degrees."""
+    problem = ro.load("scara").problem
+    i = problem.robot.joint_dimensions.index("length")
+    factor = np.where(np.arange(problem.robot.dof) == i, np.radians(1) / 1e-3, 1.0)
+    turning = replace(problem.robot, joint_types=("revolute",) * problem.robot.dof)
+    better = better_interpretation(replace(joints(lambda q: q * factor)(problem), robots=turning))
+    assert better.what == f"joint {i + 1} prismatic and its values mm"
+    assert f"name its column q{i + 1}_mm" in better.remedy
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1e3, "a thousand times smaller"), (1e-3, "a thousand times larger")])
+def test_a_robot_file_in_another_unit_is_named_before_single_rows(factor: float, said: str) -> None:
+    problem = simulated_arm("irb120")
+    robot = replace(problem.robot, mdh=problem.robot.mdh * [1, factor, 1, factor, 1])
+    p = problem.parameters
+    of_file = [bool(re.fullmatch(r"[ad]\d|tool_[xyz]", name)) for name in p.names]
+    nominal = p.nominal * np.where(of_file, factor, 1.0)
+    wrong = replace(problem, robots=robot, parameters=replace(p, nominal=nominal))
+    cause = next(text for text in likely_causes(calibrated(wrong)) if text.startswith("Likely"))
+    assert f"robot lengths {said}: correct the unit of the robot's file" in cause
+
+
 @pytest.mark.slow
 def test_a_program_without_solution_says_what_is_read_wrongly(monkeypatch, capsys, tmp_path) -> None:
     wrong, said = MISTAKES["millimetres as metres"]

@@ -24,7 +24,7 @@ from rpim_opt.robot.parameters import of_session, tool_prefix
 MOST_ROWS = 300  # rows that are tried, evenly spread where there are more
 STEPS = 20  # of a fit of base and reflectors, joint zeros too if they are free
 FEWEST_ROWS = 6
-LONGEST = 3.0  # a reflector farther from the flange [m], and than the arm is long, is none: fitted in another unit
+LONGEST = 3.0  # a reflector farther from the flange [m] is none: fitted in another unit
 LEVER = 0.3  # length of a pose's axes whose tips are fitted like points, as a part of the extent of its positions
 FULL_WEIGHT = 3.0
 """Rows farther off than so many medians count less, in proportion: gross errors do not decide what a table means."""
@@ -98,7 +98,7 @@ def points_of(problem: CalibrationProblem) -> Points | None:
         return None
     markers = list(dict.fromkeys(block.markers[0] for block in blocks))
     tools = np.array([p.nominal[p.frame(tool_prefix(marker))[:3]] for marker in markers])
-    tools[np.linalg.norm(tools, axis=1) > max(LONGEST, np.abs(problem.robot.mdh[:, [1, 3]]).sum())] = 0.0
+    tools[np.linalg.norm(tools, axis=1) > LONGEST] = 0.0
     turns = None
     if len(markers) == 1 and all(block.measurement.name == "pose" for block in blocks):
         turns = np.concatenate([transforms(block.y)[:, :3, :3] for block in blocks])
