@@ -56,7 +56,7 @@ ON_GRID = 2e-4  # part of a step by which rounded values may miss it, for their 
 NARROWER, GRID = 0.25, 61
 """Factor by which the grid for a joint's values gets narrower from round to round, and its points."""
 SEVERAL = 0.85  # several joint zeros moved, if that leaves less than this part of what one move leaves
-LOOSE = 5e-4  # backlash of a joint [rad, m] that no gear in order has: a fifth of that is usual
+LOOSE = 4e-4  # backlash of a joint [rad, m] that no gear in order has: a quarter of that is usual
 FLAT_TURN = 0.05
 """Part of their distance by which two places of a reflector differ in height and radius, if a joint turned it."""
 ANOTHER = 0.01  # joint movement [rad, m] after which no point is measured again to the last digit
