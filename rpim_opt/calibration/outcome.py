@@ -139,13 +139,14 @@ class Outcome:
         variance = max(1.0, without / max(program.model.equations - len(self.z), 1))
         if chdtrc(active, max(fall, 0.0) / variance) > CONTRADICTED:
             return ""
-        names = joined([name_of(constraint, k) for k, constraint in enumerate(self.formulation.constraints)])
+        names = joined(self.active_constraints)
         conditional = ""
         if not self.no_intervals:
             conditional = "Standard deviations and intervals are conditional on them and too small. "
         return (
-            f"The data contradict constraints ({names}): without them the objective is {three_digits(without)} instead "
-            f"of {three_digits(held)}. {conditional}Check the drawing and the nominal robot, or loosen them."
+            f"The data contradict constraints ({names}): without them squared residuals and penalty are "
+            f"{three_digits(without)} instead of {three_digits(held)}. {conditional}Check the drawing and the nominal "
+            "robot, or loosen them."
         )
 
     # --- the robot that was found ------------------------------------------------------------------------------
