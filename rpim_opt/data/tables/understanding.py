@@ -250,7 +250,8 @@ def _put_in_robots_order(read: Meanings, table: Columns, dof: int, joints: Seque
     for i, column in named.items():
         joint, *others = {str(cell) for cell in table[column]}
         if others:
-            raise InputError("the header", f"column '{column}' with {len(others) + 1} names", "one joint per column")
+            found = f"column '{column}' with {len(others) + 1} names"
+            raise InputError("the header", found, "one joint per column: of several publishers keep the rows of one")
         place = joints.index(joint) + 1 if joint in joints else 0
         if not joints and dof == len(known_names.UR_JOINTS):
             place = known_names.UR_NUMBERS.get(joint, 0)
