@@ -163,7 +163,8 @@ def read_table(
             grid = read_grid(path, options.sheet, options.encoding, options.separator)
             if turned(grid):
                 rows = [list(cells) for cells in zip_longest(*grid.rows, fillvalue="")]
-                grid = grid._replace(rows=rows, lines=list(range(1, len(rows) + 1)), blanks=False)
+                notes = (*grid.notes, "one row per quantity: transposed.")
+                grid = Grid(rows, list(range(1, len(rows) + 1)), notes)
             table = _of_grid(grid, options)
         else:
             table = RawTable(columns)
@@ -337,8 +338,17 @@ def _uncommented(row: Sequence[str], width: int, label: str) -> list[str]:
 
 
 def _columns(rows: Sequence[list[str]], heads: Sequence[tuple[str, str]], options: TableOptions) -> RawTable:
-    """Return the columns, those of numbers with decimal points."""
-    _fill(rows, len(heads), options)
+    """Return the columns, those of numbers with decimal points; blank cells behind rows may be missing or too many."""
+    width = len(heads)
+    what = "--columns, the names of files without a header" if options.columns else "the header"
+    for number, row in enumerate(rows, start=1):
+        while len(row) > width and not row[-1]:
+            row.pop()
+        lacks_remark = len(row) == width - 1 and width > 2 and not options.separator
+        if len(row) != width and not lacks_remark:
+            hint = "" if len(row) < width else "; decimal commas between commas need quotes"
+            raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
+        row += [""] * (width - len(row))
     columns: dict[str, list[str]] = {}
     groups: dict[str, str] = {}
     for j, (name, group) in enumerate(heads):
@@ -361,19 +371,6 @@ def _columns(rows: Sequence[list[str]], heads: Sequence[tuple[str, str]], option
     for name, cells in numeric.items():
         columns[name] = [cell.replace(grouping, "").replace(mark, ".") if is_numeral(cell) else cell for cell in cells]
     return RawTable(columns, groups, notes)
-
-
-def _fill(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
-    """Give every row as many cells as the header; blank ones at the end may be missing or too many."""
-    what = "--columns, the names of files without a header" if options.columns else "the header"
-    for number, row in enumerate(rows, start=1):
-        while len(row) > width and not row[-1]:
-            row.pop()
-        lacks_remark = len(row) == width - 1 and width > 2 and not options.separator
-        if len(row) != width and not lacks_remark:
-            hint = "" if len(row) < width else "; decimal commas between commas need quotes"
-            raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
-        row += [""] * (width - len(row))
 
 
 def _is_numeric(cells: Sequence[str]) -> bool:

@@ -39,7 +39,7 @@ from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.formats.urdf import branching_tip
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, find_robot, read_arm
-from rpim_opt.robot.mdh import MDH, MOUNTINGS, Robot
+from rpim_opt.robot.mdh import MDH, MOUNTINGS
 from rpim_opt.robot.parameters import frame_of, model_parameters
 from rpim_opt.store.raw import CLEARLY, Interpretation, in_time_order, interpret_tables, rows_of, usual_noise
 
@@ -336,16 +336,19 @@ def _problem_text(
     names = list(identifiable("auto", robot, parameters, rows))
     if apart:  # every session has a base of its own: one of all besides would be free
         names = [name for name in names if frame_of(name) != "base_"]
-    if context["chain"] and markers == [""]:
-        names = _at_the_ends(names, robot, base is not None)
+    if context["chain"] and markers == [""]:  # fixed joints at the chain's ends in place of base and tool
+        every = [origin for carried in row_origins(robot.model.terms) for origin in carried.origins]
+        mounts = {origin.up: origin.prefix for origin in every if origin.prefix.startswith(MOUNT)}
+        instead = {"tool_": mounts.get(False, "tool_")} | ({"base_": mounts.get(True, "")} if base is not None else {})
+        moved = [(instead.get(frame_of(name), frame_of(name)), name) for name in names]
+        names = [name if to == frame_of(name) else to + name.rpartition("_")[2] for to, name in moved if to]
     lenses = starting_cameras(rows, {})
     cameras = {
         fixture: {name: lenses[of_fixture(f"camera_{name}", fixture)] for name in list(INTRINSICS)[:4]}
         for fixture in sorted({block.fixture for block in camera_blocks(rows)})
     }
-    touched: list[str] = []
-    if kind.touching:
-        touched = [str(name) for block in rows.blocks if block.touched is not None for name in block.touched[:, 0]]
+    touches = [block.touched for block in rows.blocks if block.touched is not None]
+    touched = dict.fromkeys(str(name) for names in touches for name in names[:, 0])
     known = {direction: word for word, direction in MOUNTINGS.items()}
     options = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
     template = Environment(autoescape=False, **options)
@@ -367,22 +370,13 @@ def _problem_text(
         markers=markers,
         tool=np.where(np.abs(arm.tool) < 1e-12, 0.0, arm.tool),
         cameras=cameras,
-        touched=list(dict.fromkeys(touched))[:2],
+        touched=list(touched)[:2],
         base=None if base is None else _frame(base),
         mounting=known.get(robot.gravity.direction, list(robot.gravity.direction)),
         followers=[i for i in range(1, len(robot.mdh) + 1) if i - 1 not in robot.leading],
         identify=_patterns(names, len(robot.mdh)) + ["session_*"] * bool(apart),
     )
     return text, "\n".join(filter(None, [how, apart]))
-
-
-def _at_the_ends(names: Sequence[str], robot: Robot, based: bool) -> list[str]:
-    """Return the parameters of fixed joints at a chain's ends, if any, in place of base and tool."""
-    every = [origin for carried in row_origins(robot.model.terms) for origin in carried.origins]
-    mounts = {origin.up: origin.prefix for origin in every if origin.prefix.startswith(MOUNT)}
-    instead = {"tool_": mounts.get(False, "tool_")} | ({"base_": mounts.get(True, "")} if based else {})
-    moved = [(instead.get(frame_of(name), frame_of(name)), name) for name in names]
-    return [name if frame == frame_of(name) else frame + name.rpartition("_")[2] for frame, name in moved if frame]
 
 
 def _apart(arm: RobotSetup, rows: Dataset, tools: Mapping[str, Array]) -> str:
@@ -407,8 +401,7 @@ def _base(arm: RobotSetup, rows: Dataset, tools: Mapping[str, Array], kind: Meas
     located, _, verdict = locate(arm.robot, rows, tools)
     if same_place(located, arm.base):
         offset = 1e3 * np.linalg.norm(located[:3] - arm.base[:3])
-        how = f"Guessed: the data are in the robot's base frame, {offset:.1f} mm from the registered one."
-        return arm.base, how
+        return arm.base, f"Guessed: the data are in the robot's base frame, {offset:.1f} mm from the registered one."
     if np.linalg.norm(located[:3]) > FARTHEST:
         verdict = "implausibly far away: are the units right?"
     how = f"Guessed: the base was registered at {placed(located)}, {kind.words.frame} ({verdict})."
@@ -422,10 +415,8 @@ def _base(arm: RobotSetup, rows: Dataset, tools: Mapping[str, Array], kind: Meas
     flange = np.vstack([forward_kinematics(arm.robot, block.q[:, 0])[:, :3, 3] for block in blocks])
     measured, nominal = (1e3 * float(np.linalg.norm(points.std(axis=0))) for points in (seen, flange))
     if not nominal / UNLIKE < measured < nominal * UNLIKE:
-        how += (
-            f" The measured points spread by {measured:.3g} mm RMS, those of the nominal flange by {nominal:.3g} mm: "
-            "are the units right?"
-        )
+        how += f" The measured points spread by {measured:.3g} mm RMS, those of the nominal flange by {nominal:.3g} mm"
+        how += ": are the units right?"
     return None, how
 
 
@@ -451,6 +442,6 @@ def _frame(place: Array) -> str:
     lines = []
     for dimension, part in (("length", slice(3)), ("angle", slice(3, 6))):
         unit, numbers = exact(dimension, place[part])
-        for name, number in zip(FRAME[part], numbers, strict=True):
-            lines.append(f"{name}_{unit} = {round(number, 12) + 0.0!r}")
+        named = zip(FRAME[part], numbers, strict=True)
+        lines += [f"{name}_{unit} = {round(number, 12) + 0.0!r}" for name, number in named]
     return "\n".join(lines)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import permutations
@@ -13,7 +13,7 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.layout import RawTable, TableOptions
-from rpim_opt.basics.tables import EXCEL, Columns, read_columns
+from rpim_opt.basics.tables import EXCEL, Columns, Grid, read_columns
 from rpim_opt.basics.units import UNITS, split
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.distance import cable, distance
@@ -127,7 +127,12 @@ def interpret_tables(
 ) -> Interpretation:
     """Interpret raw tables (files or data frames) of measurements, or of targets of the arm's tool, as one table."""
     options = options or TableOptions()
-    files = [(path, _upright(raw, arm)) for path, raw in _read(data, options)]
+    wanted = {"x", "y", "z", *(f"q{i}" for i in range(1, arm.robot.dof + 1))}
+
+    def turned(grid: Grid) -> bool:
+        return wanted <= {recognize(split(row[0])[0], arm.names).stem for row in grid.rows}
+
+    files = _read(data, options, turned)
     known = pick(MEASUREMENTS, measurement, "measurement") if isinstance(measurement, str) else measurement
     if known is None:
         columns = [raw.columns for _, raw in files]
@@ -146,7 +151,7 @@ def interpret_tables(
     raise InputError("the header", f"no positions among {names}", accepted, files[0][0])
 
 
-def _read(data: Sequence[Any], options: TableOptions) -> Files:
+def _read(data: Sequence[Any], options: TableOptions, turned: Callable[[Grid], bool]) -> Files:
     """Return the tables of sources, each once; of workbooks and texts a stated sheet is the workbooks'."""
     once = {str(each) if isinstance(each, str | Path) else id(each): each for each in data}
     books = {key for key in once if Path(str(key)).suffix.lower() in EXCEL}
@@ -157,25 +162,13 @@ def _read(data: Sequence[Any], options: TableOptions) -> Files:
             continue
         path, sheet = Path(source), options.sheet if key in books or not books else ""
         try:
-            tables.append((path, read_raw(path, replace(options, sheet=sheet.strip()))))
+            tables.append((path, read_raw(path, replace(options, sheet=sheet.strip()), turned)))
         except InputError as error:  # no sheet that is called as stated, commas and all: several
             if error.where != "--sheet" or "," not in sheet:
                 raise
-            tables += [(path, read_raw(path, replace(options, sheet=each.strip()))) for each in sheet.split(",")]
+            parts = [replace(options, sheet=each.strip()) for each in sheet.split(",")]
+            tables += [(path, read_raw(path, part, turned)) for part in parts]
     return tables
-
-
-def _upright(raw: RawTable, arm: RobotSetup) -> RawTable:
-    """Return a table that has a row a quantity with a column a quantity; any other unchanged."""
-    first, *others = raw.columns.items()
-    names = [str(cell).strip() for cell in first[1]]
-    wanted = {"x", "y", "z", *(f"q{i}" for i in range(1, arm.robot.dof + 1))}
-    stems = {recognize(split(name)[0], arm.names).stem for name in names}
-    if not wanted <= stems or len(set(names)) < len(names):
-        return raw
-    columns = {name: [cells[i] for _, cells in others] for i, name in enumerate(names)}
-    columns = {"label": [name for name, _ in others], **columns}
-    return RawTable(columns, {}, (*raw.notes, "one row per quantity: transposed."), raw.units)
 
 
 def _tables(

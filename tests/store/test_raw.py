@@ -235,6 +235,16 @@ def test_what_may_mean_two_things_is_refused(monkeypatch, capsys, tmp_path, arm,
     assert not (tmp_path / "cell").exists()
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_poses_that_are_named_once_are_the_labels(monkeypatch, capsys, tmp_path, arm, turned) -> None:
+    grid = [["Pose", *HEAD[1:]], *ROWS]
+    path = tmp_path / "raw.csv"
+    path.write_text(text([], [list(cells) for cells in zip(*grid, strict=True)] if turned else grid))
+    assert new(monkeypatch, arm, tmp_path / "cell", path) == 0, capsys.readouterr().err
+    assert ("one row per quantity: transposed." in capsys.readouterr().out) == turned
+    assert list(ro.load(tmp_path / "cell").problem.data.label) == LABELS
+
+
 def test_a_compressed_table_is_to_be_unpacked(monkeypatch, capsys, tmp_path, arm) -> None:
     path = tmp_path / "raw.csv.gz"
     path.write_bytes(gzip.compress(text([HEAD], ROWS).encode()))

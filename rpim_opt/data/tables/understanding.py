@@ -200,7 +200,10 @@ def counts_rows(keys: Sequence[str]) -> bool:
 
 def _choose_label(read: Meanings, table: Columns, key: str) -> None:
     """Of several labels keep the stated key, or the one that distinguishes rows and is no row number."""
-    cells = {name: [str(cell).strip() for cell in table[name]] for name, each in read.items() if each.stem == "label"}
+    names = {name: [*map(str, table[name])] for name, each in read.items() if each.stem in ("label", "configuration")}
+    if len(names) == 1 and all(map(_unique, names.values())):  # a pose of each row
+        read.update({name: read[name]._replace(stem="label") for name in names})
+    cells = {name: [cell.strip() for cell in own] for name, own in names.items() if read[name].stem == "label"}
     for group, point in permutations(cells, 2):  # SpatialAnalyzer's, a group for every configuration
         rows = [*zip(cells[group], cells[point], strict=True)]
         repeated = len(rows) > len(set(cells[group])) > len(set(cells[point])) > 1

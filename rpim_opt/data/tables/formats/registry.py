@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from rpim_opt.basics.exceptions import InputError, in_file
 from rpim_opt.basics.files import LARGEST_DATA, require_file
 from rpim_opt.basics.layout import RawTable, TableOptions, read_table
-from rpim_opt.basics.tables import EXCEL, TEXTS, decoded
+from rpim_opt.basics.tables import EXCEL, TEXTS, Grid, decoded
 
 Rows = Sequence[Mapping[str, Any]]
 """Cells by the names of their columns, with units as in headers: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
@@ -34,8 +34,10 @@ class TableFormat(NamedTuple):
     read: Callable[[str], Rows]
 
 
-def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
-    """Return the table of a file of any format."""
+def read_raw(
+    path: Path, options: TableOptions | None = None, turned: Callable[[Grid], bool] = lambda grid: False
+) -> RawTable:
+    """Return the table of a file of any format, with ``turned`` as for `read_table`."""
     ending = path.suffix.lower()
     modules = [each.name for each in iter_modules([str(Path(__file__).parent)]) if each.name != "registry"]
     every: list[TableFormat] = [each for name in modules for each in import_module(f"{__package__}.{name}").FORMATS]
@@ -45,13 +47,13 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
         accepted = ", ".join(sorted(plain.union(*(each.endings for each in every))))
         raise InputError("the file's name", f"'{path.name}'", f"a name ending in {accepted}", path)
     if not fitting:
-        return read_table(path, options)
+        return read_table(path, options, turned=turned)
     with in_file(path):
         require_file(path, LARGEST_DATA)
         text, _ = decoded(path, options.encoding if options else "")
         name, rows = next(((each.name, rows) for each in fitting if (rows := each.read(text))), ("", ()))
         if not rows and ending in TEXTS:
-            return read_table(path, options)
+            return read_table(path, options, turned=turned)
         if not rows:
             accepted = f"{' or '.join(each.name for each in fitting)} with at least one"
             raise InputError("the file", "neither targets nor rows", accepted)
