@@ -127,10 +127,10 @@ def interpret_tables(
 ) -> Interpretation:
     """Interpret raw tables (files or data frames) of measurements, or of targets of the arm's tool, as one table."""
     options = options or TableOptions()
-    wanted = {"x", "y", "z", *(f"q{i}" for i in range(1, arm.robot.dof + 1))}
+    stated = {"x", "y", "z", *(f"q{i}" for i in range(1, arm.robot.dof + 1))}
 
     def turned(grid: Grid) -> bool:
-        return wanted <= {recognize(split(row[0])[0], arm.names).stem for row in grid.rows}
+        return stated <= {recognize(split(row[0])[0], arm.names).stem for row in grid.rows}
 
     files = _read(data, options, turned)
     known = pick(MEASUREMENTS, measurement, "measurement") if isinstance(measurement, str) else measurement
