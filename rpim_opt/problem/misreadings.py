@@ -492,7 +492,7 @@ def _other_lengths(points: Points) -> Iterator[Misreading]:
         if abs(by) > WRONG * points.extent:
             i, column = places[k]
             mdh[i, column] += by
-            now, stated = (f"{round(1e3 * float(each[i, column]))} mm" for each in (mdh, robot.mdh))
+            now, stated = (f"{round(1e3 * each[i, column])} mm" for each in (mdh, robot.mdh))
             said.append(f"{'ad'[column > 1]}{i + 1} about {now}, not {stated}")
     remedy = "check these lengths in the robot's file (in a URDF, origins of joints), and whether it is this robot's"
     yield _with_robot(joined(said), remedy, replace(robot, mdh=mdh))
