@@ -463,41 +463,6 @@ def _other_robots(points: Points) -> Iterator[Misreading]:
             yield _with_robot(what, remedy, other)
 
 
-def _other_lengths(points: Points) -> Iterator[Misreading]:
-    """Yield the reading with one or two other lengths of the robot's file that fits best.
-
-    A point in any frame, of any reflector, is linear in position and rotation of the nominal flange, and in its motion
-    by a length that is wrong.
-    """
-    robot, count = points.robot, len(points.y)
-    if points.lengths or count < FEW:
-        return
-    T = forward_kinematics(robot, points.q)
-    known = np.hstack([T[:, :3, 3], T[:, :3, :3].reshape(count, 9), np.ones((count, 1))])
-    places = [(i, k) for i in range(len(robot.mdh)) for k in (1, 3)]
-    moved = []
-    for place in places:
-        mdh = robot.mdh.copy()
-        mdh[place] += 1.0
-        moved.append(forward_kinematics(replace(robot, mdh=mdh), points.q)[:, :3, 3] - T[:, :3, 3])
-    fits = []
-    for i, j in combinations(range(len(places)), 2):
-        X = np.hstack([known, moved[i], moved[j]])
-        slopes = np.linalg.lstsq(X, points.y, rcond=None)[0]
-        fits.append((float(np.sum((points.y - X @ slopes) ** 2)), (i, j), slopes))
-    _, two, slopes = min(fits, key=lambda each: each[0])
-    mdh, turn = robot.mdh.copy(), slopes[:3]  # from the robot's base to the instrument, nearly
-    said = []
-    for k, by in zip(two, np.sum(turn * slopes[-6:].reshape(2, 3, 3), axis=(1, 2)) / np.sum(turn**2), strict=True):
-        if abs(by) > WRONG * points.extent:
-            i, column = places[k]
-            mdh[i, column] += by
-            now, stated = (f"{round(1e3 * each[i, column])} mm" for each in (mdh, robot.mdh))
-            said.append(f"{'ad'[column > 1]}{i + 1} about {now}, not {stated}")
-    remedy = "check these lengths in the robot's file (in a URDF, origins of joints), and whether it is this robot's"
-    yield _with_robot(joined(said), remedy, replace(robot, mdh=mdh))
-
-
 # Which of these fits
 
 
@@ -520,7 +485,7 @@ def better_interpretation(problem: CalibrationProblem, whole: bool = True) -> Be
     if not np.isfinite(present):
         return None
     chain, left = _mistakes(points, present)
-    for further in ((_factors, _other_robots, _other_lengths), (_orders,)):
+    for further in ((_factors, _other_robots), (_orders,)):
         if left >= BETTER * present and present > WRONG and not points.by_camera and whole:
             first = [each for readings in further for each in readings(points)]
             chain, left = _chain(points, present, first, BETTER * present, 2)

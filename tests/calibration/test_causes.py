@@ -974,15 +974,6 @@ def test_a_quill_that_is_not_declared_prismatic_is_named() -> None:
     assert f"name its column q{i + 1}_mm" in better.remedy
 
 
-def test_lengths_of_another_version_of_the_arm_are_named() -> None:
-    problem = simulated_arm("iiwa7")
-    mdh = problem.robot.mdh.copy()
-    mdh[2, 1], mdh[3, 3] = 0.45, 0.2
-    better = better_interpretation(replace(problem, robots=replace(problem.robot, mdh=mdh)))
-    assert re.fullmatch(r"a3 about -?\d mm, not 450 mm and d4 about -?\d mm, not 200 mm", better.what)
-    assert "check these lengths in the robot's file" in better.remedy
-
-
 @pytest.mark.parametrize(("factor", "said"), [(1e3, "a thousand times smaller"), (1e-3, "a thousand times larger")])
 def test_a_robot_file_in_another_unit_is_named_before_single_rows(factor: float, said: str) -> None:
     problem = simulated_arm("irb120")
