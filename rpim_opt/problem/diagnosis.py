@@ -1082,12 +1082,13 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
     model, free = problem.with_repeatability(None).linearize(x), problem.parameters.free
     if len(model.b) < 3 * len(x):
         return
+    r, without = model.b - model.A @ (x / free.scale), _without_parameters(model)
     joints = [(i, free.names.index(name)) for i, name in enumerate(_zeros(problem.robot), 1) if name in free.names]
     joints = [(i, k) for i, k in joints if model.A[:, k].any()]
     best, alone, said = most, np.inf, ""
     for some in [*combinations(joints, 1), *combinations(joints, 2)]:
         numbers = [k for _, k in some]
-        left, step, _ = _either_side(model, x, problem.owners, [model.A[:, [k]] for k in numbers])
+        left, step, _ = _either_side(r, without, problem.owners, [model.A[:, [k]] for k in numbers])
         if len(some) == 1:
             alone = min(alone, left)
         apart = 2e3 * np.abs(step) * free.scale[numbers]
@@ -1115,10 +1116,10 @@ def two_loads(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     A = A[:, A.any(axis=0)]
     if len(model.b) < 3 * len(x) or not A.size:
         return
-    left, _, side = _either_side(model, x, problem.owners, [A])
+    r = model.b - model.A @ (x / p.free.scale)
+    left, _, side = _either_side(r, _without_parameters(model), problem.owners, [A])
     rows = np.flatnonzero(side[:, 0] == (1 if side.sum() <= 0 else -1))
-    whole_size = rms(model.b - model.A @ (x / p.free.scale))
-    if left < LOADS and left * whole_size < NOTICED and len(rows) >= FEWEST:
+    if left < LOADS and left * rms(r) < NOTICED and len(rows) >= FEWEST:
         yield (
             f"{_rows(problem.data, rows, 'fits', 'fit')} another load at the flange (one of two loads in every row "
             f"explains the residuals; that leaves {100 * left:.0f} %): was a tool or a workpiece attached? State "
@@ -1127,14 +1128,12 @@ def two_loads(problem: CalibrationProblem, x: Array) -> Iterator[str]:
 
 
 def _either_side(
-    model: LinearModel, x: Array, rows: np.ndarray, groups: Sequence[Array]
+    r: Array, without: Callable[[Array], Array], rows: np.ndarray, groups: Sequence[Array]
 ) -> tuple[float, Array, np.ndarray]:
-    """Return what part of the residuals at x (n,) groups of columns (m, k) leave that count +1 or -1 in every row.
+    """Return what part of residuals r (m,) groups of columns (m, k) leave that count +1 or -1 in every row.
 
     Beside it their coefficients, and the sides (N, groups). They start with what changes residuals most.
     """
-    r: Array = model.b - model.A @ (x / model.parameters.scale)
-    without = _without_parameters(model)
     steps: Any = []
     for G in groups:
         moments = np.column_stack([np.bincount(rows, column * r) for column in G.T])
