@@ -397,7 +397,8 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
     if not any(kind.registers for kind in kinds.values()):
         return (
             f"Missing: the base frame, which {joined(list(kinds))} readings do not determine: more of them hardly "
-            f"reduce U, at most {1e3 * bound:.3f} mm. Survey the base or the anchor, and state the result in [prior] "
+            f"reduce U, at most {1e3 * bound:.3f} mm. Measure from three anchors or more (column `fixture`), or state "
+            "what a survey or the drawing says of the anchor, its length and the first link in [prior] "
             '(known = ["anchor_x = 900 +- 0.05 mm", ...]).'
         )
     measured = reached_positions(result, found.region, _measured(result), found.requirement.confidence)[1].max()

@@ -1088,11 +1088,13 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
     best, alone, said = most, np.inf, ""
     for some in [*combinations(joints, 1), *combinations(joints, 2)]:
         numbers = [k for _, k in some]
-        left, step, _ = _either_side(r, without, problem.owners, [model.A[:, [k]] for k in numbers])
+        left, step, side = _either_side(r, without, problem.owners, [model.A[:, [k]] for k in numbers])
         if len(some) == 1:
             alone = min(alone, left)
         apart = 2e3 * np.abs(step) * free.scale[numbers]
-        if left < (best if len(some) == 1 else min(best, MOVED * alone)) and apart.min() >= 1e3 * LOOSE:
+        slipped = np.count_nonzero(np.diff(side, axis=0)) <= len(some)  # each joint once
+        limit = best if len(some) == 1 else min(best, MOVED * alone)
+        if left < limit and apart.min() >= 1e3 * LOOSE and not slipped:
             best = left
             units = ["mrad" if free.dimensions[k] == "angle" else "mm" for k in numbers]
             names = [numbered(i - 1, problem.robot.joint_names) for i, _ in some]

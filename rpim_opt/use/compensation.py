@@ -142,6 +142,8 @@ class Compensation:
         counts = {"miss their target": len(self.missed) - uncertain, unsure: uncertain}
         said = "{} of {} commands {}; do not execute these rows."
         lines += [said.format(count, len(self.q), what) for what, count in counts.items() if count]
+        if self.missed and np.isfinite(self.orientation_error).any() and self.orientation_error.max() > REACHED:
+            lines.append("Position comes first with --position-only (orientation=False).")
         vague = EXPANDED * self.std > self.position_before
         if vague.mean() > 0.5 and np.isfinite(self.std).all():
             lines.append(

@@ -638,6 +638,26 @@ def test_a_reference_that_was_measured_again_is_no_obstacle_to_a_key(monkeypatch
     assert "without a match, ignored: REF1, REF1." in said
 
 
+def test_a_reference_in_both_files_leaves_the_names_of_the_others(monkeypatch, capsys, tmp_path, arm) -> None:
+    """By a key its rows are ignored; by the time they keep their name, and all rows were numbered."""
+    files = [tmp_path / "robot.csv", tmp_path / "tracker.csv"]
+    names = ["REF", *(f"P{i}" for i in range(COUNT - 2)), "REF"]
+    files[0].write_text(
+        text(
+            [["Name", "Time [s]", *HEAD[1:7]]],
+            [[n, str(i), *q] for i, (n, q) in enumerate(zip(names, JOINTS, strict=True))],
+        )
+    )
+    rows = [[n, str(i), *p] for i, (n, p) in enumerate(zip(names, POINTS, strict=True))]
+    files[1].write_text(text([["Target", "Time [s]", *HEAD[7:]]], rows[::-1]))
+    for more, count in ((["--key", "Target"], COUNT - 2), (["--time-tolerance", "0.1"], COUNT)):
+        assert new(monkeypatch, arm, tmp_path / f"cell{count}", files, *more) == 0
+        said = capsys.readouterr().out
+        assert f"{count} rows match, of {COUNT} with joints and {COUNT} measured" in said
+        assert ("same name, ignored: REF" in said) == (count < COUNT)
+        assert {"P0", f"P{COUNT - 3}"} <= {*ro.load(tmp_path / f"cell{count}").problem.data.label}
+
+
 def test_what_publishers_count_their_messages_by_is_no_key(monkeypatch, capsys, tmp_path, arm) -> None:
     files = [tmp_path / "robot.csv", tmp_path / "tracker.csv"]
     head = ["%time", "field.header.seq"]

@@ -150,10 +150,10 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
     count = len(chosen.left)
     if sorted([chosen.left, chosen.right]) == [[str(i) for i in range(k, k + count)] for k in (0, 1)]:
         chosen = _row_numbers(joints, values, None)  # one file counts from 0
-    place = {name: i for i, name in enumerate(chosen.left)}
-    if len(place) < len(chosen.left):
-        twice = Counter(chosen.left).most_common(1)[0][0]
-        raise InputError(f"the key {chosen.how}", f"'{twice}' twice in {joints.file}", "unique keys")
+    again = [name for name, number in Counter(chosen.left).items() if number > 1]
+    place = {name: i for i, name in enumerate(chosen.left) if name not in again}
+    if len(place) < SAME * len(chosen.left):
+        raise InputError(f"the key {chosen.how}", f"'{again[0]}' twice in {joints.file}", "unique keys")
     right = [i for i, name in enumerate(chosen.right) if name in place]
     if not right:
         if not key and all(time_column(side.raw) is not None and len(side.labels) > 1 for side in (joints, values)):
@@ -168,8 +168,10 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
     names = [chosen.right[i] for i in right]
     counts = f"{len(right)} rows match, of {len(chosen.left)} with joints and {len(chosen.right)} measured"
     notes = [f"joined by {chosen.how}: {counts}."]
-    lonely = [name for name in chosen.left if name not in set(names)]
-    lonely += [name for name in chosen.right if name not in place]
+    if again:
+        notes.append(f"several rows of {joints.file} have the same name, ignored: {listed(again)}.")
+    lonely = [name for name in chosen.left if name not in {*names, *again}]
+    lonely += [name for name in chosen.right if name not in {*place, *again}]
     if lonely:
         notes.append(f"without a match, ignored: {listed(lonely)}.")
     return Match([place[name] for name in names], right, names, notes, chosen.columns)
@@ -247,17 +249,16 @@ def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]
 
 
 def _naming(table: CanonicalTable) -> dict[str, list[str]]:
-    """Return the keys of columns, labels or left out, that name every row differently, or every row of a reflector.
+    """Return the keys of columns, labels or left out, that name nearly every row, or row of a reflector, differently.
 
-    Of measured rows nearly every one: some name is a reference point that was measured again.
+    Some name is that of a reference point that was measured again.
     """
     free = [each.column for each in table.meant if each.name in ("", "label", "configuration")]
     free = [name for name in free if not COUNTER.fullmatch(name)]
     cells = {name: _normal(table.raw[name.lower()]) for name in free if name.lower() in table.raw}
     markers = table.columns.get("marker", [""] * len(table.labels))
     rows = {name: {*zip(keys, markers, strict=True)} for name, keys in cells.items()}
-    least = len(table.labels) * (1.0 if any(name.startswith("q1") for name in table.columns) else SAME)
-    return {name: keys for name, keys in cells.items() if all(keys) and len(rows[name]) >= least}
+    return {name: keys for name, keys in cells.items() if all(keys) and len(rows[name]) >= SAME * len(keys)}
 
 
 def _row_numbers(joints: CanonicalTable, values: CanonicalTable, pair: Key | None) -> Key:

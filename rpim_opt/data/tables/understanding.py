@@ -29,6 +29,7 @@ INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
 """In the name of a coordinate that is not the robot's own; actual may be either."""
 CONTROLLER = re.compile(r"\$?pos_act|actual_tcp", re.IGNORECASE)
 """Beginning of coordinates that a controller computes: KUKA's and Universal Robots'."""
+REPEATED = 0.2  # share of rows whose label is there again, up to which they are of a reference point
 INCOMPLETE = 0.25  # share of the rows that may lack one of several values, and are left out then
 MEANINGS = {
     "label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
@@ -493,8 +494,14 @@ def _rows_with_values(table: CanonicalTable, robot: Robot, kind: Measurement) ->
         columns = {"configuration": own, **columns, "label": both}
     elif not _unique(own):
         again = next((label for label in own if own.count(label) > 1), "")
-        notes.append(f"labels are not unique ('{again}'): rows are numbered.")
-        del columns["label"]
+        single = [own.count(label) == 1 for label in own]
+        if all(own) and single.count(False) <= REPEATED * len(own):  # a reference point, of other rows in other files
+            notes.append(f"labels are not unique: rows '{again}' have their number behind it.")
+            named = zip(own, single, strict=True)
+            columns["label"] = [label if one else f"{label} (row {i})" for i, (label, one) in enumerate(named, start=1)]
+        else:
+            notes.append(f"labels are not unique ('{again}'): rows are numbered.")
+            del columns["label"]
     return replace(whole, columns=columns, notes=tuple(notes))
 
 
