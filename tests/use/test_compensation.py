@@ -189,6 +189,15 @@ def test_the_limit_of_a_result_holds_for_its_commands() -> None:
     assert "Target point: the reflector" in note
 
 
+def test_commands_that_miss_name_the_option_by_which_position_comes_first() -> None:
+    result = calibrated()[0]
+    far = [[9.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0]]
+    for poses, named in ((far, True), (np.array(far)[:, :3], False)):
+        found = ro.use.compensate(result, poses=np.array(poses), despite_verdict=True)
+        assert found.missed == ["1"]
+        assert ("Position comes first with --position-only" in str(found)) == named
+
+
 @pytest.mark.parametrize("name", ROBOTS)
 def test_positions_alone_need_smaller_corrections(name: str) -> None:
     result, q = known(name), commands(ROBOTS[name])
