@@ -39,7 +39,7 @@ from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.formats.urdf import branching_tip
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, find_robot, read_arm
-from rpim_opt.robot.mdh import MDH, MOUNTINGS
+from rpim_opt.robot.mdh import MDH, MOUNTINGS, Robot
 from rpim_opt.robot.parameters import frame_of, model_parameters
 from rpim_opt.store.raw import CLEARLY, Interpretation, in_time_order, interpret_tables, rows_of, usual_noise
 
@@ -336,12 +336,8 @@ def _problem_text(
     names = list(identifiable("auto", robot, parameters, rows))
     if apart:  # every session has a base of its own: one of all besides would be free
         names = [name for name in names if frame_of(name) != "base_"]
-    if context["chain"] and markers == [""]:  # fixed joints at the chain's ends in place of base and tool
-        every = [origin for carried in row_origins(robot.model.terms) for origin in carried.origins]
-        mounts = {origin.up: origin.prefix for origin in every if origin.prefix.startswith(MOUNT)}
-        instead = {"tool_": mounts.get(False, "tool_")} | ({"base_": mounts.get(True, "")} if base is not None else {})
-        moved = [(instead.get(frame_of(name), frame_of(name)), name) for name in names]
-        names = [name if to == frame_of(name) else to + name.rpartition("_")[2] for to, name in moved if to]
+    if context["chain"] and markers == [""]:
+        names = _at_the_ends(names, robot, base is not None)
     lenses = starting_cameras(rows, {})
     cameras = {
         fixture: {name: lenses[of_fixture(f"camera_{name}", fixture)] for name in list(INTRINSICS)[:4]}
@@ -377,6 +373,15 @@ def _problem_text(
         identify=_patterns(names, len(robot.mdh)) + ["session_*"] * bool(apart),
     )
     return text, "\n".join(filter(None, [how, apart]))
+
+
+def _at_the_ends(names: Sequence[str], robot: Robot, based: bool) -> list[str]:
+    """Return the parameters of fixed joints at a chain's ends, if any, in place of base and tool."""
+    every = [origin for carried in row_origins(robot.model.terms) for origin in carried.origins]
+    mounts = {origin.up: origin.prefix for origin in every if origin.prefix.startswith(MOUNT)}
+    instead = {"tool_": mounts.get(False, "tool_")} | ({"base_": mounts.get(True, "")} if based else {})
+    moved = [(instead.get(frame_of(name), frame_of(name)), name) for name in names]
+    return [name if frame == frame_of(name) else frame + name.rpartition("_")[2] for frame, name in moved if frame]
 
 
 def _apart(arm: RobotSetup, rows: Dataset, tools: Mapping[str, Array]) -> str:

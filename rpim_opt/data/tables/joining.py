@@ -150,10 +150,10 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
     count = len(chosen.left)
     if sorted([chosen.left, chosen.right]) == [[str(i) for i in range(k, k + count)] for k in (0, 1)]:
         chosen = _row_numbers(joints, values, None)  # one file counts from 0
-    again = [name for name, number in Counter(chosen.left).items() if number > 1]
+    again = {name: number for name, number in Counter(chosen.left).items() if number > 1}
     place = {name: i for i, name in enumerate(chosen.left) if name not in again}
     if len(place) < SAME * len(chosen.left):
-        raise InputError(f"the key {chosen.how}", f"'{again[0]}' twice in {joints.file}", "unique keys")
+        raise InputError(f"the key {chosen.how}", f"'{next(iter(again))}' twice in {joints.file}", "unique keys")
     right = [i for i, name in enumerate(chosen.right) if name in place]
     if not right:
         if not key and all(time_column(side.raw) is not None and len(side.labels) > 1 for side in (joints, values)):
@@ -169,9 +169,9 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
     counts = f"{len(right)} rows match, of {len(chosen.left)} with joints and {len(chosen.right)} measured"
     notes = [f"joined by {chosen.how}: {counts}."]
     if again:
-        notes.append(f"several rows of {joints.file} have the same name, ignored: {listed(again)}.")
-    lonely = [name for name in chosen.left if name not in {*names, *again}]
-    lonely += [name for name in chosen.right if name not in {*place, *again}]
+        notes.append(f"several rows of {joints.file} have the same name, ignored: {listed(list(again))}.")
+    matched, known = set(names), {*place, *again}
+    lonely = [name for name in place if name not in matched] + [name for name in chosen.right if name not in known]
     if lonely:
         notes.append(f"without a match, ignored: {listed(lonely)}.")
     return Match([place[name] for name in names], right, names, notes, chosen.columns)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
@@ -493,8 +494,9 @@ def _rows_with_values(table: CanonicalTable, robot: Robot, kind: Measurement) ->
         notes.append("labels combine point and reflector.")
         columns = {"configuration": own, **columns, "label": both}
     elif not _unique(own):
-        again = next((label for label in own if own.count(label) > 1), "")
-        single = [own.count(label) == 1 for label in own]
+        times = Counter(own)
+        again = next((label for label, count in times.items() if count > 1), "")
+        single = [times[label] == 1 for label in own]
         if all(own) and single.count(False) <= REPEATED * len(own):  # a reference point, of other rows in other files
             notes.append(f"labels are not unique: rows '{again}' have their number behind it.")
             named = zip(own, single, strict=True)

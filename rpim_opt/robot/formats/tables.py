@@ -125,11 +125,7 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
     """Return the robot that the keys of a ``robot.toml`` describe, whatever file they come from."""
     table = validate(_RobotTable, content, path)
     for column in ANGLES:
-        stated = [value for joint in content["joint"] if (value := joint.get(f"{column}_deg"))]
-        turns = [turn for value in stated for turn in TURNS if abs(abs(value) - turn) < NEARLY]
-        if stated and len(turns) == len(stated):
-            accepted = f"degrees ({turns[0]:.5g} is {TURNS[turns[0]]} rad: name the column {column}_rad)"
-            raise InputError(f"column {column}_deg", f"{stated[0]:g}", accepted)
+        _refuse_radians(column, [joint.get(f"{column}_deg") for joint in content["joint"]])
     dof = len(table.joint)
     coupling = np.eye(dof).tolist() if table.coupling is None else table.coupling
     if len(coupling) != dof or {len(row) for row in coupling} - {len(coupling[0])} or not 0 < len(coupling[0]) <= dof:
@@ -153,6 +149,15 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
         gravity=gravity_with(gravity, table.mounting, table.payload, path),
     )
     return replace(robot, limits=np.array([limits[i] for i in robot.leading], dtype=float))
+
+
+def _refuse_radians(column: str, degrees: Sequence[float | None]) -> None:
+    """Refuse a column of degrees whose numbers, but for zeros, are all quarters and halves of a turn in radians."""
+    stated = [value for value in degrees if value]
+    turns = [turn for value in stated for turn in TURNS if abs(abs(value) - turn) < NEARLY]
+    if stated and len(turns) == len(stated):
+        accepted = f"degrees ({turns[0]:.5g} is {TURNS[turns[0]]} rad: name the column {column}_rad)"
+        raise InputError(f"column {column}_deg", f"{stated[0]:g}", accepted)
 
 
 def _ending(path: Path, endings: Sequence[str], others: str = "") -> str:
