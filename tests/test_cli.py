@@ -14,7 +14,7 @@ import pytest
 
 from rpim_opt import cli
 from rpim_opt.convex.solvers.conic import Unsolved
-from rpim_opt.store.problem_file import problems_folder
+from rpim_opt.store import problems_folder
 
 KEYS = {"nominal", "identification", "validation", "weight", "selector", "formulation", "converged", "iterations",
         "flagged", "parameters"}  # fmt: skip

@@ -28,7 +28,7 @@ from rpim_opt.data.tables.understanding import interpret
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.library import read_arm
 from rpim_opt.robot.mdh import MDH
-from rpim_opt.use.validation import validate
+from rpim_opt.use import validate
 from tests import SHARED
 from tests.robot.test_exchange import CONF, YAML
 from tests.simulate import ARM, simulated

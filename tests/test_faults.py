@@ -14,7 +14,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt import cli
 from rpim_opt.robot.library import find_robot
-from rpim_opt.store.problem_file import problems_folder
+from rpim_opt.store import problems_folder
 from tests.faults import FAULTS, Audit, Layer
 from tests.fuzz.seeds import CONF, KINEMATICS, TRACKED, URDF, make_cell
 

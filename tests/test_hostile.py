@@ -16,7 +16,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.tables import csv_text, read_columns
 from rpim_opt.basics.text import visible
-from rpim_opt.use.compensation import compensate
+from rpim_opt.use import compensate
 from tests.test_cli import edit, folder, run
 
 assert folder is not None  # the fixture

@@ -11,7 +11,7 @@ import rpim_opt as ro
 from rpim_opt.basics.files import read_bytes
 from rpim_opt.basics.text import LONGEST, Tabled, shortened, table
 from rpim_opt.basics.units import UNITS, split_unit
-from rpim_opt.robot.formats.tables import write_robot
+from rpim_opt.robot import write_robot
 from tests.simulate import ARM
 
 

@@ -11,6 +11,7 @@ from scipy.stats import multivariate_normal
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.bayes import Prior
 from rpim_opt.bayes.evidence import (
     FACTORS,
     NOISE_SD,
@@ -22,7 +23,6 @@ from rpim_opt.bayes.evidence import (
     widening,
 )
 from rpim_opt.bayes.hyperparameters import Estimator
-from rpim_opt.bayes.prior import Prior
 from rpim_opt.problem.noise import Stack
 
 NOISE = ("position", "orientation", "joint")

@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.evidence import Evidence, Point
 from rpim_opt.bayes.hyperparameters import MOST, Estimator, sampled
 from rpim_opt.bayes.outliers import clustered, error_ratios, outlier_candidates, resistant_fit, unexplained
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data import Dataset
 
 POSITION = ro.load("position").problem
 

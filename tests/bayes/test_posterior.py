@@ -11,7 +11,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.bayes import Prior
 from rpim_opt.bayes.population import data_likelihood
-from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem import LinearModel
 
 PROBLEM = ro.load("position").problem
 FREE = PROBLEM.parameters.free

@@ -15,9 +15,10 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.acceptance import inconclusive, measured_workspace
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.calibration.uncertainty import held_out_errors
-from rpim_opt.problem.blocks import PartitionedProblem
+from rpim_opt.problem import PartitionedProblem
 from rpim_opt.problem.multi_robot import unknown_sessions
-from rpim_opt.robot.parameters import model_parameters, of_session
+from rpim_opt.robot import model_parameters
+from rpim_opt.robot.parameters import of_session
 from rpim_opt.study.arms import BASE, KINDS, SCALES, TOOL
 
 SHIFT, TURN = 3e-4, 1e-4

@@ -14,7 +14,7 @@ from rpim_opt.calibration import verdict, words
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.report import report
 from rpim_opt.report.summary import headline
-from rpim_opt.robot.terms import Curve, transmission
+from rpim_opt.robot import Curve, transmission
 from tests.simulate import ARM
 
 ROBOT = dataclasses.replace(

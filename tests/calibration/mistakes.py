@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 import rpim_opt as ro
-from rpim_opt.robot.formats.tables import read_robot
+from rpim_opt.robot import read_robot
 from rpim_opt.robot.library import READY
 
 NOISE = 5e-5

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration import influence, likely_causes
-from rpim_opt.calibration.held_out import refit_all
+from rpim_opt.calibration import influence, likely_causes, refit_all
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.data.record import Requirement
-from rpim_opt.problem.blocks import PartitionedProblem
+from rpim_opt.data import Requirement
+from rpim_opt.problem import PartitionedProblem
 from tests.simulate import simulated
 
 IDENTIFY = ("theta[23]", "d4", "tool_[xyz]", "base_*")

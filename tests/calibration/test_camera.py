@@ -15,9 +15,9 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.units import split_unit
 from rpim_opt.calibration.words import camera_remarks
-from rpim_opt.report.report import write_report
+from rpim_opt.report import write_report
 from rpim_opt.report.summary import summary
-from rpim_opt.store.problem_file import problems_folder
+from rpim_opt.store import problems_folder
 from rpim_opt.study.studies import load_study
 
 STUDY = load_study(Path(__file__).parents[2] / "studies" / "camera.py")

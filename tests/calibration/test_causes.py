@@ -17,7 +17,7 @@ from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.problem import misreadings
 from rpim_opt.problem.diagnosis import left_out_together, other_rows, rows_without_values, two_positions
 from rpim_opt.problem.misreadings import better_interpretation
-from rpim_opt.robot.formats.tables import read_robot
+from rpim_opt.robot import read_robot
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.library import READY
 from tests.calibration import mistakes

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.report.report import write_report
+from rpim_opt.report import write_report
 from rpim_opt.store.instances import UNSTATED
 from rpim_opt.study.studies import load_study
 from tests import SHARED

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.basics.exceptions import NoSolutionFound, RpimError
+from rpim_opt.basics import NoSolutionFound, RpimError
 from tests.simulate import simulated
 
 SOME = ("a?", "d?", "theta?")

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration import influence
-from rpim_opt.calibration.leverage import Influence
-from rpim_opt.calibration.result import Calibration
-from rpim_opt.problem.blocks import PartitionedProblem
-from rpim_opt.problem.linear import LinearModel
+from rpim_opt.calibration import Calibration, Influence, influence
+from rpim_opt.problem import LinearModel, PartitionedProblem
 
 
 def without(model: LinearModel, number: int) -> LinearModel:

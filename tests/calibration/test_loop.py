@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration.certificate import Certificate, certified
+from rpim_opt.calibration import Certificate, Iteration
+from rpim_opt.calibration.certificate import certified
 from rpim_opt.calibration.identify import ending
-from rpim_opt.calibration.loop import Ended, Iteration, Loop, Options, State, weight_choice
+from rpim_opt.calibration.loop import Ended, Loop, Options, State, weight_choice
 from tests.simulate import simulated
 
 PROBLEM, _ = simulated(noise=5e-5)

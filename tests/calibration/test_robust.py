@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.store.problem_file import problems_folder
+from rpim_opt.store import problems_folder
 from tests.test_cli import run
 
 BLUNDERS = set(tomllib.loads((problems_folder() / "blunders" / "truth.toml").read_text())["blunders"])

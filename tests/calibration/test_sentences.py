@@ -11,11 +11,11 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.bayes.hyperparameters import ExcludedRow, Hyperparameter, Learned, Trial
-from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import Acceptance, Workspace, repeatability_bounds
-from rpim_opt.calibration.certificate import Certificate, certified
+from rpim_opt.calibration import Acceptance, Certificate, words
+from rpim_opt.calibration.acceptance import Workspace, repeatability_bounds
+from rpim_opt.calibration.certificate import certified
 from rpim_opt.calibration.lack_of_fit import Autocorrelation, LackOfFit, autocorrelation
-from rpim_opt.data.record import Requirement
+from rpim_opt.data import Requirement
 
 LIMIT = Requirement(1e-4)
 

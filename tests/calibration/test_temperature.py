@@ -9,7 +9,8 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.robot.parameters import EXPANSION, REFERENCE, model_parameters
+from rpim_opt.robot import model_parameters
+from rpim_opt.robot.parameters import EXPANSION, REFERENCE
 from rpim_opt.study.arms import BASE, KINDS, SCALES, TOOL
 
 ALUMINIUM = 23e-6

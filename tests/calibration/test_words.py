@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration import words
-from rpim_opt.calibration.certificate import Certificate
+from rpim_opt.calibration import Certificate, Verdict, words
 from rpim_opt.calibration.diagnosis import ActiveBound, Flag, ShadowPrice
 from rpim_opt.calibration.identify import ending
 from rpim_opt.calibration.loop import Ended, State
-from rpim_opt.calibration.verdict import Verdict
 from tests.calibration.test_loop import state
 
 RESULT = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, 1e-3)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.convex import Formulation
 from rpim_opt.convex import expressions as atoms
 from rpim_opt.convex.expressions import ATOMS, SQUARES, named
-from rpim_opt.convex.formulation import FORMULATIONS, Formulation
+from rpim_opt.convex.formulation import FORMULATIONS
 from rpim_opt.convex.quadratic import quadratic
 from rpim_opt.convex.structure import Expressions, declared
 

@@ -10,10 +10,10 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import rpim_opt as ro
-from rpim_opt.basics.exceptions import NoSolutionFound
+from rpim_opt.basics import NoSolutionFound
 from rpim_opt.convex.formulation import FORMULATIONS
-from rpim_opt.problem.linear import LinearModel
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.problem import LinearModel
+from rpim_opt.robot import Parameters
 from tests.simulate import simulated
 
 VARIANTS = (

@@ -15,7 +15,7 @@ from rpim_opt.convex.infeasible import conflict, name_of
 from rpim_opt.convex.quadratic import quadratic
 from rpim_opt.convex.rules.scores import linear_rule
 from rpim_opt.convex.rules.selection import EDGES
-from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem import LinearModel
 from tests.convex.test_formulation import model
 
 MODEL = model(condition=30.0)

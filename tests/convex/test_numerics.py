@@ -14,8 +14,8 @@ from rpim_opt import baselines
 from rpim_opt.convex.rules.folds import held_out_error
 from rpim_opt.convex.rules.selection import weight_grid
 from rpim_opt.convex.select import SELECTORS
-from rpim_opt.problem.linear import LinearModel
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.problem import LinearModel
+from rpim_opt.robot import Parameters
 from tests.convex.plain import plain
 from tests.nist import sets
 from tests.simulate import simulated

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex.program import Damping, Estimate
+from rpim_opt.convex import Estimate
+from rpim_opt.convex.program import Damping
 from tests.convex.test_formulation import model
 
 MODEL = model(condition=30.0).scaled(np.full(30, 3.0))

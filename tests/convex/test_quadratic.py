@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rpim_opt.convex.quadratic import Quadratic, Ridge, identity, ridge, robot_alone
-from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem import LinearModel
 from tests.convex.test_formulation import model
 
 N = 12

@@ -22,7 +22,7 @@ from rpim_opt.convex.constraints import (
     signed,
 )
 from rpim_opt.convex.formulation import unavailable
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot import Parameters
 
 NAMES = ("alpha1", "a1", "alpha2", "a2", "base_x", "base_rz", "tool_x", "d12")
 KINDS = ("angle", "length", "angle", "length", "length", "angle", "length", "length")

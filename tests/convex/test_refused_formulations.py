@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.bayes.prior import Prior, kind_of
+from rpim_opt.bayes import Prior
+from rpim_opt.bayes.prior import kind_of
 from rpim_opt.convex.constraint_parser import combination
 from tests.convex.test_formulation import model
 

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 import rpim_opt as ro
 from rpim_opt.convex.robust_loss import Inliers, inliers_of, kept_equations, limits, noise_level, outlying
-from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem import LinearModel
 from tests.simulate import simulated
 
 COUNT = np.array([1, 2, 3, 3, 6])

@@ -14,7 +14,7 @@ from rpim_opt.convex.rules.curve import menger
 from rpim_opt.convex.rules.folds import held_out_error
 from rpim_opt.convex.rules.selection import weight_grid
 from rpim_opt.convex.select import SELECTORS
-from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem import LinearModel
 from tests.convex.test_formulation import model
 from tests.simulate import simulated
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics import InputError
+from rpim_opt.calibration import Calibration
 from rpim_opt.calibration.diagnosis import ShadowPrice
-from rpim_opt.calibration.result import Calibration
 
 HOME = np.zeros((1, 6))
 FIXTURE = {"x": (0.2, 0.5), "y": (-0.2, 0.2), "z": (0.0, 0.5)}

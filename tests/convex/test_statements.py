@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics import InputError
 from rpim_opt.convex.constraint_parser import Sentence, Sum, sentence
 
 

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rpim_opt.robot.formats.tables import write_robot
-from rpim_opt.robot.kinematics import forward_kinematics
+from rpim_opt.robot import forward_kinematics, write_robot
 from tests import ROOT
 from tests.simulate import ARM
 from tests.store.instrument_files import INSTRUMENTS

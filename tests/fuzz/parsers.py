@@ -21,12 +21,13 @@ from rpim_opt.basics.tables import csv_text, read_columns
 from rpim_opt.basics.units import parse_units
 from rpim_opt.convex.constraint_parser import sentence
 from rpim_opt.convex.formulation import formulation_of
+from rpim_opt.data import read_data
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.data.tables.reading import read_data
 from rpim_opt.report.console import listed_numbers, payload_of, tool_frame
-from rpim_opt.robot.chain import RobotSetup
+from rpim_opt.robot import RobotSetup
 from rpim_opt.robot.library import find_robot
-from rpim_opt.store.problem_file import named_weight, problems_folder
+from rpim_opt.store import problems_folder
+from rpim_opt.store.problem_file import named_weight
 from rpim_opt.store.raw import interpret_tables, usual_noise
 from rpim_opt.store.result_file import digest
 

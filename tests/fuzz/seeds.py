@@ -12,7 +12,7 @@ import numpy as np
 
 import rpim_opt as ro
 from rpim_opt.robot.library import find_robot
-from rpim_opt.store.problem_file import problems_folder
+from rpim_opt.store import problems_folder
 
 CORPUS = Path(__file__).with_name("corpus")
 PROBLEM = (

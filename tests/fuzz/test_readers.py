@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rpim_opt.basics.exceptions import RpimError
+from rpim_opt.basics import RpimError
 from tests.fuzz.parsers import PARSERS
 from tests.fuzz.seeds import found, seeds, words
 

@@ -14,8 +14,9 @@ import rpim_opt as ro
 from rpim_opt.basics import threads
 from rpim_opt.calibration import words
 from rpim_opt.convex.robust_loss import QuadraticModel, inliers_of
+from rpim_opt.problem import PartitionedProblem
 from rpim_opt.problem import blocks as parts_module
-from rpim_opt.problem.blocks import PartitionedProblem, in_parts, whole_configurations
+from rpim_opt.problem.blocks import in_parts, whole_configurations
 
 
 def thirds(problem: ro.CalibrationProblem) -> list[np.ndarray]:

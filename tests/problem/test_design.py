@@ -9,7 +9,8 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.tables import csv_text
-from rpim_opt.problem.design import choose, joint_cells, random_candidates, read_candidates
+from rpim_opt.problem import choose, random_candidates
+from rpim_opt.problem.design import joint_cells, read_candidates
 from tests.simulate import simulated
 from tests.test_cli import run
 

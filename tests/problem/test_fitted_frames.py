@@ -9,9 +9,9 @@ import pytest
 from scipy.optimize import least_squares
 
 import rpim_opt as ro
+from rpim_opt.problem import PartitionedProblem, fitted_frames
 from rpim_opt.problem import blocks as parts_module
-from rpim_opt.problem.blocks import PartitionedProblem, in_parts
-from rpim_opt.problem.registration.frames import fitted_frames
+from rpim_opt.problem.blocks import in_parts
 
 NAMES = ["position", "pose", "markers", "cable", "distance", "mixed", "plane", "sphere", "far_frames", "scara"]
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem.registration.closed_forms import register
+from rpim_opt.problem import register
 from rpim_opt.problem.registration.frames import locate
 from rpim_opt.robot.kinematics import numeric_frame
 from tests.calibration.mistakes import simulated_arm

@@ -11,9 +11,9 @@ import rpim_opt as ro
 from rpim_opt.calibration import inspect
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.problem.registration.global_start import mapped
-from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
+from rpim_opt.robot import Robot, forward_kinematics
+from rpim_opt.robot.kinematics import numeric_frame
 from rpim_opt.robot.library import find_robot
-from rpim_opt.robot.mdh import Robot
 
 COUNT, UNSEEN, NOISE = 20, 60, 5e-4
 QUARTER = np.pi / 2

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.design import combination, observe
+from rpim_opt.problem import observe
+from rpim_opt.problem.design import combination
 from rpim_opt.problem.problem import near_parallel
 from rpim_opt.robot.library import find_robot
 from tests.simulate import simulated

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
-from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem import LinearModel
 from rpim_opt.problem.registration.points import FEWEST_ROWS, Points, fit_points, misfit, points_of
 from tests.simulate import ARM
 

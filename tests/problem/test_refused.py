@@ -9,15 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
+from rpim_opt.data import KnownAngle, KnownDistance, touches
 from rpim_opt.data.measurements.camera import on_board
-from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touches
 from rpim_opt.data.measurements.distance import plane
 from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.tables.reading import declared_noise
-from rpim_opt.problem.blocks import partitions
+from rpim_opt.problem import configurations_at, partitions
 from rpim_opt.problem.registration.camera import starting_camera, with_poses
 from rpim_opt.problem.registration.frames import locate
-from rpim_opt.problem.workspace import configurations_at, touched_place, within
+from rpim_opt.problem.workspace import touched_place, within
 from rpim_opt.report.console import touched_point
 from tests.problem.test_camera import BOARD, LENS, SIGMA, world
 from tests.simulate import ARM

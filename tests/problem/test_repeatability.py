@@ -9,9 +9,9 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.problem import Repeatability
 from rpim_opt.problem.blocks import reduced
 from rpim_opt.problem.linear import reduced_rows
-from rpim_opt.problem.noise import Repeatability
 
 REPEATABILITY = Repeatability(position=4e-5, orientation=1e-4, joint=7e-5, instrument=0.8)
 NAMES = ("position", "pose", "markers", "mixed", "cable", "distance")

@@ -15,10 +15,10 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
+from rpim_opt.problem import CalibrationProblem, PartitionedProblem, partitions
 from rpim_opt.problem import blocks as streaming
-from rpim_opt.problem.blocks import PartitionedProblem, partitions, reduced
+from rpim_opt.problem.blocks import reduced
 from rpim_opt.problem.linear import reduced_rows
-from rpim_opt.problem.problem import CalibrationProblem
 
 PARTS, ROWS = 5, 1100
 

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.bayes import Prior
 from rpim_opt.bayes.hyperparameters import Estimator
 from rpim_opt.bayes.outliers import clustered, error_ratios
-from rpim_opt.bayes.prior import Prior
-from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touches, with_known
+from rpim_opt.data import KnownAngle, KnownDistance, touches, with_known
+from rpim_opt.problem import Repeatability
 from rpim_opt.problem.contact import Touches, contrasted
-from rpim_opt.problem.noise import Equations, Repeatability
+from rpim_opt.problem.noise import Equations
 
 SIGMA = 3e-5
 NAMES = ("A", "B", "C", "D")

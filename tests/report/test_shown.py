@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics import InputError
 from rpim_opt.report import console
 
 INSTANCE = ro.load("position")

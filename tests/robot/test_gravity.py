@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot.extensions import _draws, moment_slopes
+from rpim_opt.robot import moment_slopes
+from rpim_opt.robot.extensions import _draws
 from rpim_opt.robot.kinematics import numeric_frame
 from tests.robot.test_exchange import urdf_kinematics
 from tests.simulate import ARM

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot.library import robots
+from rpim_opt.robot import robots
 
 
 @pytest.mark.parametrize("name", robots())

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot.extensions import EXPECTED, extension_scales
-from rpim_opt.robot.formats.tables import write_robot
+from rpim_opt.robot import extension_scales, write_robot
+from rpim_opt.robot.extensions import EXPECTED
 from tests.simulate import ARM
 
 MDH = ARM.mdh

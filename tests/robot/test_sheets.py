@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot.formats.tables import read_sheet, write_robodk, write_robot
+from rpim_opt.robot import write_robodk, write_robot
+from rpim_opt.robot.formats.tables import read_sheet
 from rpim_opt.robot.kinematics import numeric_frame, numeric_link
 from rpim_opt.robot.library import read_arm
 from tests.simulate import ARM

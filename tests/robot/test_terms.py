@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.robot import Configuration, Joint
 from rpim_opt.robot.kinematics import transforms
 from rpim_opt.robot.parameters import of_joint, of_term
-from rpim_opt.robot.terms import JOINT_TERMS, Configuration, Joint, Weight, terms_of
+from rpim_opt.robot.terms import JOINT_TERMS, Weight, terms_of
 from tests.simulate import ARM
 
 Q = np.random.default_rng(0).uniform(-2, 2, (7, 6))

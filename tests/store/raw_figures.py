@@ -16,7 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.text import markdown
-from rpim_opt.robot.formats.tables import write_robot
+from rpim_opt.robot import write_robot
 from tests.simulate import ARM
 from tests.store.raw_files import APART, COUNT, EVERY_Q, EVERY_T, HEAD, NOISE, RAW, beside, cells, text, write
 from tests.test_cli import run

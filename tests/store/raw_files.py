@@ -13,8 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
-from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
-from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot import Robot, forward_kinematics
+from rpim_opt.robot.kinematics import numeric_frame
 from tests.simulate import ARM
 
 COUNT = 36

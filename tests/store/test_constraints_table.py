@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import rpim_opt as ro
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics import InputError
 from rpim_opt.cli import app
 from rpim_opt.convex.constraints import Parsed
 from tests import ROOT

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rpim_opt.store.problem_file import problems_folder
+from rpim_opt.store import problems_folder
 from tests.test_cli import edit, run
 
 SECRET = "secret_column\n1\n"

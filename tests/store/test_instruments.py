@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.basics.files import read_toml
-from rpim_opt.robot.formats.tables import write_robot
+from rpim_opt.robot import write_robot
 from tests.simulate import ARM
 from tests.store.fresh_files import FRESH
 from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, RPY, STRANGERS, krl

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.store import find_problem
 from rpim_opt.store.new_folder import stated_target
-from rpim_opt.store.problem_file import find_problem
 from rpim_opt.store.result_file import digest
 from tests import ROOT
 from tests.simulate import simulated

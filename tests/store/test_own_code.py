@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot.formats.tables import write_robot
-from rpim_opt.robot.kinematics import forward_kinematics
+from rpim_opt.robot import forward_kinematics, write_robot
 from tests.simulate import ARM
 from tests.test_cli import run
 

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.store.problem_file import problems_folder
+from rpim_opt.store import problems_folder
 from rpim_opt.store.simulation import write_simulation
 from tests import SHARED
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.data.tables.joining import partners
-from rpim_opt.robot.formats.tables import write_robot
+from rpim_opt.robot import write_robot
 from tests.simulate import ARM
 from tests.store.raw_figures import CLEAN, MOST, TABLE, judged
 from tests.store.raw_files import (

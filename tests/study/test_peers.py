@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rpim_opt.basics.exceptions import RpimError
+from rpim_opt.basics import RpimError
 from rpim_opt.study import studies
 
 CASE = {"tool": "pybotics", "situation": "clean10", "seed": 0, "quick": True}

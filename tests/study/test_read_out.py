@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.study import Report
 from rpim_opt.study.methods import UNDELIVERED, problems_of
-from rpim_opt.study.studies import Report, load_study, write
+from rpim_opt.study.studies import load_study, write
 from tests import ROOT
 from tests.study.test_comparison import POSITION, rows_of
 

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.robot.library import find_robot
-from rpim_opt.store.problem_file import problems_folder
+from rpim_opt.store import problems_folder
 from tests.simulate import ARM, simulated
 
 SCARA = ro.read_robot(problems_folder() / "scara" / "robot.toml")

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics import InputError
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.use.monitoring import cusum, cusum_limit

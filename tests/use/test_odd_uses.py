@@ -12,9 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
-from rpim_opt.problem.blocks import PartitionedProblem
-from rpim_opt.problem.noise import Repeatability
-from rpim_opt.use.export import export_files, write_all
+from rpim_opt.problem import PartitionedProblem, Repeatability
+from rpim_opt.use import export_files
+from rpim_opt.use.export import write_all
 from rpim_opt.use.monitoring import Drift
 from rpim_opt.use.recalibration import Cause, Moved
 from tests.simulate import simulated

@@ -15,9 +15,9 @@ import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.calibration.acceptance import measured_workspace
+from rpim_opt.robot import model_parameters
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame
-from rpim_opt.robot.parameters import model_parameters
 from rpim_opt.study.arms import BASE, KINDS, SCALES, TOOL
 from tests import ROOT
 from tests.test_cli import run

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics import InputError
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.calibration.uncertainty import position_budget
-from rpim_opt.store.problem_file import problems_folder
+from rpim_opt.store import problems_folder
 from rpim_opt.store.result_file import digest
 from tests.simulate import simulated
 from tests.test_cli import run
