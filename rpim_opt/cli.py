@@ -505,8 +505,7 @@ def update(
         )
         updated = recalibration.result
         updated = replace(updated, record=replace(updated.record, files={file.name: sha256_of(file) for file in data}))
-    failed = not (recalibration.explained and updated.verdict.delivered)
-    return Output(recalibration, recalibration.content(), int(failed), _saved(updated, out), read)
+    return Output(recalibration, recalibration.content(), int(not recalibration.delivered), _saved(updated, out), read)
 
 
 @command

@@ -152,6 +152,18 @@ class Update:
         """Whether readings and the previous calibration agree, apart from the changes."""
         return self.after.likely
 
+    @property
+    def unsure(self) -> tuple[str, ...]:
+        """Parameters and frames whose change is smaller than twice its standard deviation."""
+        moved = {each.name: abs(each.change) > 2 * each.std for each in self.moved if isinstance(each, Moved)}
+        sizes = {c.name: [moved[name] for name in c.members if name in moved] for c in self.changes}
+        return tuple(name for name, sure in sizes.items() if sure and not any(sure))
+
+    @property
+    def delivered(self) -> bool:
+        """Whether all is explained and determined, and the calibration is delivered."""
+        return self.explained and not self.unsure and not self.undetermined and self.result.verdict.delivered
+
     @cached_property
     def lacking(self) -> str:
         """A sentence on an effect that the model lacks by the new rows, and what to do; empty without one."""
@@ -170,6 +182,7 @@ class Update:
             "causes": [cause._asdict() for cause in self.causes],
             "readings": self.readings,
             "undetermined": self.undetermined,
+            "unsure": self.unsure,
             "errors": self.errors,
             "lacking": self.lacking,
             "converged": self.result.converged,
@@ -210,6 +223,11 @@ class Update:
             lines.append(
                 f"The new rows do not determine the pose of {joined(self.undetermined)}: measure at least three "
                 "configurations with the reflector's positions not on a line, or omit --reset if nothing was moved."
+            )
+        if self.unsure:
+            lines.append(
+                f"The new rows do not determine the change of {joined(self.unsure)}, which is smaller than twice its "
+                "standard deviation: measure more configurations."
             )
         for name, of in self.errors.items():
             was, now = (f"{of[when]['rms_mm']:.4f} mm" for when in ("before", "after"))
@@ -285,6 +303,7 @@ def update(
             break
         say(f"releasing {cause.name}")
         changes.append(cause)
+        problem = problem.with_parameters(updated.problem.parameters)  # of a base where it was registered
         if cause.kind == "reading":
             problem = problem.without(set(cause.members))
         else:
@@ -294,9 +313,10 @@ def update(
         refuse_misread(result, data)
         missed = rms(updated.errors(data))
         if missed > STRANGE * float(np.nanmax(result.nominal_errors())):
-            same = f"those of the same robot ({_robots(result)}) in the same units and instrument's frame"
+            same = f"those of the same robot ({_robots(result)}) in the same units"
+            known = "" if {*base} & {*released} else " and instrument's frame, or --reset with what moved (base_*)"
             found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
-            raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
+            raise InputError("the new measurements", found, same + known)
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
     updated = _with_scales_of_motion(result, updated, problem, released, prior_inflation)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
