@@ -142,8 +142,8 @@ class Compensation:
         counts = {"miss their target": len(self.missed) - uncertain, unsure: uncertain}
         said = "{} of {} commands {}; do not execute these rows."
         lines += [said.format(count, len(self.q), what) for what, count in counts.items() if count]
-        if self.missed and np.isfinite(self.orientation_error).any() and self.orientation_error.max() > REACHED:
-            lines.append("Position comes first with --position-only (orientation=False).")
+        if len(self.missed) > uncertain and np.isfinite(self.orientation_error).any():
+            lines.append("Position comes first without --orientation, and alone counts with --position-only.")
         vague = EXPANDED * self.std > self.position_before
         if vague.mean() > 0.5 and np.isfinite(self.std).all():
             lines.append(
@@ -174,6 +174,7 @@ class Compensation:
         """Return the error of a row, its U where that counts, and the joints at a limit where it misses its target."""
         error = f"error {1e3 * self.position_error[row]:.3f} mm"
         error += f", U {1e3 * EXPANDED * self.std[row]:.3f} mm" if self.status[row] == ABOVE else ""
+        error += f", {1e3 * self.orientation_error[row]:.3f} mrad" if self.orientation_error[row] > REACHED else ""
         if self.status[row] != "limited" and self.position_error[row] <= REACHED:
             return error
         low, high = self.robot.limits.T
@@ -265,11 +266,12 @@ def compensate(
     **Targets.** ``q`` (N, dof) are commands of the nominal controller [rad or m], ``poses`` targets in the base, (N, 7)
     x, y, z [m] and unit quaternion, w first, or (N, 3) positions. With both, ``q`` is where to look for the poses;
     without ``q`` every pose is looked for from several configurations within the limits that come near. ``label`` names
-    the rows, ``robot`` is which of several. Orientations are corrected where known better than nominally: where the
-    standard uncertainty of w is larger (RMS of all rows), as where positions of one reflector hardly determine it, w
-    is instead the turn by which the correction changes the orientation, and |w|^2 counts 1e-6 m^2: position comes
-    first, and |D|^2 counts 1e-9 m^2 rad^-2. ``orientation=True`` corrects them all the same, with ``False`` those of
-    targets are ignored.
+    the rows, ``robot`` is which of several.
+
+    **Orientation.** Position comes first: where this leaves some of p, |w|^2 counts 1e-6 m^2 instead, and |D|^2 1e-9
+    m^2 rad^-2. So it does where the standard uncertainty of an orientation is larger than w, as where positions of one
+    reflector hardly determine it; w is then the turn by which the correction changes it. ``orientation=True`` corrects
+    all orientations, at the cost of positions where both cannot be had; with ``False`` those of targets are ignored.
 
     **Tool.** Both robots have the same tool, so that no difference of tools is compensated: ``tool`` (6,) in the flange
     frame, x, y, z [m], roll, pitch, yaw [rad], the controller's TCP, or by default the reflector of the calibration
@@ -368,18 +370,14 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
         return cell.begun(Targets._make(None if each is None else each[start : start + BLOCK] for each in targets))
 
     parts = on_all_cores(begun, range(0, len(targets.label), BLOCK))
-    why = ""
-    if orientation is None and cell.kind is pose:
-        turns = [(cell.norms(each.before)[1], cell.uncertainty(each.commands, each.targets)[1]) for each in parts]
-        turn, of_turn = (1e3 * np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in zip(*turns, strict=True))
-        if turn < of_turn < np.inf or cell.fit_covariance is None:
-            known = "its uncertainty is unknown"
-            if np.isfinite(of_turn):
-                known = f"its correction, {turn:.2f} mrad, would be smaller than its standard uncertainty, "
-                known += f"{of_turn:.2f} mrad (RMS)"
-            why = f" Orientation is not corrected: {known}; --orientation corrects it anyway."
-    ended = on_all_cores(lambda part: cell.ended(part, largest, turning=not why), parts)
+    ended = on_all_cores(lambda part: cell.ended(part, largest, orientation), parts)
     fields: dict[str, Any] = {name: np.concatenate([each[name] for each in ended]) for name in ended[0]}
+    kept = np.count_nonzero(~fields.pop("turning"))
+    known = "its correction would be smaller than its standard uncertainty"
+    if cell.fit_covariance is None:
+        known = "its uncertainty is unknown"
+    rows = f"{kept} of {len(targets.label)} targets"
+    why = f" Orientation of {rows} is not corrected: {known}; --orientation corrects it anyway." if kept else ""
     there = np.concatenate([part.reached[:, :3] for part in parts])
     targets_at = there + np.concatenate([(part.before - part.missed)[:, :3] for part in parts])
     if len(there) >= MOVED:
@@ -534,16 +532,20 @@ class _Cell(NamedTuple):
                 beside = self.norms(self.nominal.at(q, load, poses)[1])[0]
         return _Begun(targets, load, commands, target, missed, *self.identified.at(commands, load, target), beside)
 
-    def ended(self, begun: _Begun, largest: float, turning: bool) -> dict[str, Array]:
-        """Return the fields of a `Compensation` for some targets; without ``turning`` orientations stay as they are."""
+    def ended(self, begun: _Begun, largest: float, orientation: bool | None) -> dict[str, Array]:
+        """Return the fields of a `Compensation` for some targets, and whether it is ``turning`` each (N,)."""
         targets, load, commands, target, missed, pose_before, before, J, beside = begun
-        W = counts = attainable(J)
+        N, k, n = J.shape
+        counts = np.broadcast_to(attainable(J), (N, k, k))
         reached = self._reached(missed, counts)
-        wanted, due = target, np.where(reached[:, None], before - missed, 0.0)
-        if not turning:
-            wanted, due, W = np.hstack([target[:, :3], pose_before[:, 3:]]), POSITION * due, counts * FIRST
+        choice = orientation is None and self.kind is pose
+        turning = np.full((N, 1), True)
+        if choice:
+            turning[:, 0] = self.norms(before)[1] >= self.uncertainty(commands, targets)[1]
+        wanted = np.where(turning | (np.arange(target.shape[1]) < 3), target, pose_before)
+        due = np.where(reached[:, None], before - missed, 0.0) * np.where(turning, 1.0, POSITION[:k])
+        W = counts * np.where(turning, 1.0, FIRST[:k])[:, None]
         # P = V diag(p) V' of W J = U diag(s) V', see `compensate`
-        n = J.shape[2]
         U, s, Vt = np.linalg.svd(W @ J, full_matrices=True)
         some = s.shape[1]
         e = np.zeros((len(J), n))
@@ -551,18 +553,23 @@ class _Cell(NamedTuple):
         s = np.pad(s, ((0, 0), (0, n - some)))
         p = np.maximum((e / largest) ** 2 - s**2, 0.0)
         p += NULL_SPACE_WEIGHT * s[:, :1] ** 2 * (s <= 1e-9 * s[:, :1])
-        P = np.einsum("nki,nk,nkj->nij", Vt, p, Vt) + (0.0 if turning else STILL) * np.eye(n)
+        still = STILL * np.eye(n)
+        P = np.einsum("nki,nk,nkj->nij", Vt, p, Vt) + np.where(turning[:, None], 0.0, still)
         lowest, highest = self.robot.limits.T
         inside = np.clip(commands, lowest, highest)
-        limits = np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
+        limits = np.array([np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)])
         corrected, left, active = nearest(self.identified, load, wanted, commands, limits, W, P)
+        first = np.flatnonzero(choice & turning[:, 0] & reached & (self.norms(left)[0] > REACHED))
+        if len(first):  # the whole pose cannot be had
+            there = load[first], wanted[first], commands[first], limits[:, first], counts[first] * FIRST, still[None]
+            corrected[first], left[first], active[first] = nearest(self.identified, *there)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        met = self._reached(left if turning else KEPT * left, counts)
+        met = self._reached(left * np.where(turning, 1.0, KEPT[:k]), counts)
         cases = {"ok": met, "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
-        fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
+        fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status, "turning": turning}
         fields["position_before"], fields["orientation_before"] = self.norms(before)
-        error = left if turning else self.identified.at(corrected, load, target)[1]
+        error = self.identified.at(corrected, load, target)[1]
         fields["position_error"], fields["orientation_error"] = self.norms(error)
         fields["std"], fields["orientation_std"] = self.uncertainty(corrected, targets)
         return fields
@@ -691,7 +698,7 @@ class Arm(NamedTuple):
 
 
 def nearest(
-    arm: Arm, load: Array, y: Array, start: Array, limits: tuple[Array, Array], W: Array, P: Array
+    arm: Arm, load: Array, y: Array, start: Array, limits: tuple[Array, Array] | Array, W: Array, P: Array
 ) -> tuple[Array, Array, np.ndarray]:
     """Minimize |W error|^2 + D' P D over low <= q <= high, q = start + D, row by row.
 
