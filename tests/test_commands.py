@@ -547,6 +547,15 @@ def test_new_says_that_the_nominal_robot_does_not_explain_the_data_before_what_i
     assert re.search(r"\(the nominal robot does not explain the data, RMS error \d+ mm; optimum of the regist", guessed)
 
 
+@pytest.mark.slow
+def test_joint_values_that_are_ignored_are_a_likely_cause(monkeypatch, capsys, cell, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    arguments = ("--data", str(cell / "measured.csv"), "--units", "rad,m", "--urdf-tip", "link_5")
+    assert run(monkeypatch, "new", "short", "--robot", str(cell / "arm.urdf"), *arguments) == 0
+    assert run(monkeypatch, "calibrate", "short", "--out", "short") == 1
+    assert "Likely: joint values joint_6 are ignored, since the robot has 5:" in capsys.readouterr().out
+
+
 def test_the_links_that_new_was_given_are_those_of_export(monkeypatch, capsys, cell, tmp_path) -> None:
     monkeypatch.chdir(tmp_path)
     beside = (

@@ -507,6 +507,10 @@ def likely_causes(result: Outcome) -> list[str]:
     elif signs or not result.converged:
         causes = _held(result, problem) or _limited_by_formulation(result, problem, kept)
         causes = causes or [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
+        ignored = result.record.details.get("ignored_joints")
+        if ignored:
+            state = "state another robot, or a link behind them (--urdf-tip), if these move the tool"
+            causes.insert(0, f"joint values {ignored} are ignored, since the robot has {problem.robot.dof}: {state}.")
         shared += together
     elif (other := _other_robot(result, problem)) is not None:
         causes = [other.sentence]

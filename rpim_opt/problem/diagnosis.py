@@ -144,12 +144,12 @@ def all_q(data: Dataset) -> Array:
     return np.concatenate([block.q.reshape(-1, block.q.shape[2]) for block in data.blocks])
 
 
-def _rows(data: Dataset, rows: np.ndarray, of_one: str, of_several: str) -> str:
-    """Name rows before their verb."""
+def _rows(data: Dataset, rows: np.ndarray, of_one: str, of_several: str, most: int = 8) -> str:
+    """Name rows, the first so many, before their verb."""
     labels = [data.label[i] for i in rows]
     if len(labels) == 1:
         return f"row {labels[0]} {of_one}"
-    return f"rows {listed(labels)} {of_several}"
+    return f"rows {listed(labels, most)} {of_several}"
 
 
 def arm_length(robot: Robot, blocks: Iterable[Block]) -> float:
@@ -502,25 +502,28 @@ def _odd_values(problem: CalibrationProblem, points: Points) -> Iterator[str]:
     """
     points = replace(points, turns=None)
     whole = misfit(points)
-    turning = [i for i, kind in enumerate(points.robot.joint_types) if kind == "revolute"]
-    fitted = {f"joint {points.robot.joint(i)}": replace(points, q=_values_that_fit(points, i)) for i in turning}
+    joints = range(points.robot.dof)
+    fitted = {f"joint {points.robot.joint(i)}": replace(points, q=_values_that_fit(points, i)) for i in joints}
     for k, axis in enumerate("xyz"):
         other = points
         for _ in range(MOST_ROUNDS):
             other = replace(points, y=np.where(np.arange(3) == k, fit_points(other).modelled, points.y))
         fitted[f"coordinate {axis}"] = other
     left = {column: misfit(each) for column, each in fitted.items()}
-    column = min(left, key=left.__getitem__)
-    if left[column] >= min(BETTER * whole, WRONG):  # free values take up much of any other mistake
+    first, *others = sorted(left, key=left.__getitem__)
+    if left[first] >= min(BETTER * whole, WRONG):  # free values take up much of any other mistake
         return
-    best = fitted[column]
+    best = fitted[first]
+    column = " or ".join([first, *(other for other in others if left[other] < 2 * left[first])])
     apart = np.abs(np.angle(np.exp(1j * (best.q - points.q)))).max(axis=1) > LEAST_TRAVEL["revolute"] / 2
     apart |= np.abs(best.y - points.y).max(axis=1) > WRONG * points.extent
+    if not apart.any():  # small errors of all rows
+        return
     what = f"{_rows(problem.data, points.row[apart], 'has', 'have')} wrong values of {column}"
     if apart.sum() > len(apart) / 2:
         what = f"the values of {column} explain nothing (sorted, copied, shuffled, without signs, another quantity?)"
     yield (
-        f"{what}: with fitted ones the points agree to {three_digits(1e3 * left[column] * points.extent)} mm instead "
+        f"{what}: with fitted ones the points agree to {three_digits(1e3 * left[first] * points.extent)} mm instead "
         f"of {three_digits(1e3 * whole * points.extent)} mm; check its column."
     )
 
@@ -532,7 +535,10 @@ def _unsigned(values: Array) -> np.ndarray:
 
 
 def _values_that_fit(points: Points, joint: int, known: Fit | None = None) -> Array:
-    """Return joint values (N, dof) in which one joint's are those that fit best, with base and reflectors if known."""
+    """Return joint values (N, dof) in which one joint's are those that fit best, with base and reflectors if known.
+
+    They are within pi [rad, m].
+    """
     q, width = points.q, np.pi
     around: Any = 0.0
     for _ in range(MOST_ROUNDS):
@@ -684,7 +690,7 @@ def _turned_joint(problem: CalibrationProblem, out: Points, fit: Fit, limit: flo
     reached = float(np.mean(1 - np.sqrt(1 - np.minimum(limit / away, 1) ** 2)))
     best = max(FEW, len(out.row) / 2) - 1
     said = ""
-    for i in np.flatnonzero(np.array(out.robot.joint_types) == "revolute"):
+    for i in np.flatnonzero(np.array(out.robot.joint_dimensions) == "angle"):
         q = _values_that_fit(out, int(i), fit)
         explained = np.linalg.norm(out.y - _modelled(replace(out, q=q), fit), axis=1) < limit
         chance = bdtrc(explained.sum() - 1, len(explained), reached) * out.robot.dof
@@ -811,7 +817,8 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
     left, limit = np.inf if best is None else best[0], min(TWO_KINDS, acceptable)
     if single:
         sides = min(limit, most**0.5 * 0.5 ** (len(problem.data) / len(model.b)), MOVED * left)
-        yield from first(two_positions(problem, x, sides), _said_of_addition(best))
+        states = two_states(problem, x, min(LOADS, sides))
+        yield from first(two_positions(problem, x, sides), _said_of_addition(best), states)
         return
     # zeros of all joints fit two gross errors, whatever these are, but no more
     what, cause = "set of joint zeros", "did several joints slip, or were they remastered"
@@ -828,8 +835,8 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
         said = [_said_of_kinds(problem, rows, part)] if kinds else ()
         noise = _uneven_noise(problem, x) if acceptable == 1 else ()  # else errors are too large for noise
         backlash = two_positions(problem, x, min(limit, part / MOVED) if kinds else limit)
-        loads = () if problem.touches else two_loads(problem, x)
-        yield from first(backlash, said, noise, loads, scattered_rows(problem, x))
+        states = () if problem.touches else two_states(problem, x)
+        yield from first(backlash, states, said, noise, scattered_rows(problem, x))
 
 
 def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[str]:
@@ -1062,7 +1069,7 @@ def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
 
 def _said_of_kinds(problem: CalibrationProblem, rows: np.ndarray, left: float) -> str:
     """Return the sentence on rows of two kinds."""
-    named, label = _rows(problem.data, rows, "fits", "fit"), problem.data.label
+    named, label = _rows(problem.data, rows, "fits", "fit", len(rows)), problem.data.label
     if np.ptp(rows) == len(rows) - 1:
         named = f"rows {label[rows[0]]} to {label[rows[-1]]} fit"
     return (
@@ -1107,26 +1114,46 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
         )
 
 
-def two_loads(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Report rows whose residuals at x (n,) the deflection of joints under one of two loads explains, to the noise."""
+def two_states(problem: CalibrationProblem, x: Array, most: float = LOADS) -> Iterator[str]:
+    """Report rows whose residuals at x (n,) one of two loads, bases or reflectors explains, to the noise.
+
+    They leave less than a part ``most`` of them.
+    """
     every = np.array(problem.parameters.names)
     p, bends = problem.parameters, np.char.startswith(every, "compliance")
     model, whole = problem.with_repeatability(None).linearize(x), problem.identifying(p.identified | bends)
     there = np.zeros(len(whole.parameters.free))
     there[p.identified[whole.parameters.identified]] = x
-    A = whole.with_repeatability(None).linearize(there).A[:, bends[whole.parameters.identified]]
-    A = A[:, A.any(axis=0)]
-    if len(model.b) < 3 * len(x) or not A.size:
+    A = whole.with_repeatability(None).linearize(there).A
+    if len(model.b) < 3 * len(x):
         return
-    r = model.b - model.A @ (x / p.free.scale)
-    left, _, side = _either_side(r, _without_parameters(model), problem.owners, [A])
-    rows = np.flatnonzero(side[:, 0] == (1 if side.sum() <= 0 else -1))
-    if left < LOADS and left * rms(r) < NOTICED and len(rows) >= FEWEST:
-        yield (
-            f"{_rows(problem.data, rows, 'fits', 'fit')} another load at the flange (one of two loads in every row "
-            f"explains the residuals; that leaves {100 * left:.0f} %): was a tool or a workpiece attached? State "
-            "payload_kg of every row and add `compliance?` to `identify`, or calibrate the two groups separately."
-        )
+    separately = "or calibrate the two groups separately"
+    stated = f"State payload_kg of every row and add `compliance?` to `identify`, {separately}"
+    states = {
+        "load at the flange": ("compliance", f"was a tool or a workpiece attached? {stated}"),
+        "base": (
+            "base_",
+            f"does the robot or the instrument tip, or stand loose? Fix it and measure again, {separately}",
+        ),
+        "reflector": ("tool_", f"is it loose, or are there two? Name them in a column `marker`, {separately}"),
+    }
+    r, without = model.b - model.A @ (x / p.free.scale), _without_parameters(model)
+    best, said = most, ""
+    for what, (prefix, cause) in states.items():
+        columns = A[:, np.char.startswith(whole.parameters.free.names, prefix)]
+        columns = columns[:, columns.any(axis=0)]
+        if not columns.size:
+            continue
+        left, _, side = _either_side(r, without, problem.owners, [columns])
+        rows = np.flatnonzero(side[:, 0] == (1 if side.sum() <= 0 else -1))
+        if left < best and left * rms(r) < NOTICED and len(rows) >= FEWEST:
+            best, fit = left, _rows(problem.data, rows, "fits", "fit", len(rows))
+            said = (
+                f"{fit} another {what} (one of two in every row explains the residuals; that leaves "
+                f"{100 * left:.0f} %): {cause}."
+            )
+    if said:
+        yield said
 
 
 def _either_side(
@@ -1190,7 +1217,12 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
         way = np.diff(q, axis=0, prepend=q[:1])[problem.owners]
         lag = np.sum([zero * way[:, i] for i, zero in of_zero.items()], axis=0)
         remedy = "read both when the arm stands still"
-        yield Addition(lag[:, None], lambda c: (f"joint values lag behind by {100 * c[0]:.2g} % of each move", remedy))
+
+        def lags(c: Array) -> tuple[str, str]:
+            way = "lag behind" if c[0] > 0 else "run ahead"
+            return f"joint values {way} by {100 * abs(c[0]):.2g} % of each move", remedy
+
+        yield Addition(lag[:, None], lags)
 
 
 def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterator[Addition]:

@@ -137,7 +137,7 @@ def pose_misfit(robot: Robot, data: Dataset, tool: Array | None = None) -> float
 
 def _readings(points: Points) -> list[Misreading]:
     """Return all single mistakes that are looked for."""
-    readings = [*_of_joints(points.robot), *_of_rows(len(points.row), points.robot)]
+    readings = [*_of_joints(points.robot), *_of_rows(points)]
     if points.by_camera:
         remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or vice versa'
         return [*readings, Misreading("the camera and the board exchanged", remedy, _inverted)]
@@ -326,11 +326,11 @@ def _of_poses() -> Iterator[Misreading]:
         yield Misreading(what, f"move their columns one row {back}", partial(_slipped, None, by))
 
 
-def _slipped(joints: int | slice | None, by: int, points: Points) -> Points:
-    """Return points with the values of a joint or all, or the orientations, of the row that is so many rows later."""
+def _slipped(joints: Any, by: int, points: Points) -> Points:
+    """Return points with joint values of an index, or the orientations, of the row that is so many rows later."""
     q, turns = points.q.copy(), points.turns
     if joints is not None:
-        q[..., joints] = np.roll(q[..., joints], -by, axis=0)
+        q[joints] = np.roll(q[joints], -by, axis=0)
     elif turns is not None:
         turns = np.roll(turns, -by, axis=0)
     rows = np.arange(len(q))
@@ -357,16 +357,21 @@ def _inverted(points: Points) -> Points:
     return replace(points, y=-np.einsum("nij,nj->ni", back, points.y), turns=back)
 
 
-def _of_rows(count: int, robot: Robot) -> Iterator[Misreading]:
+def _of_rows(points: Points) -> Iterator[Misreading]:
     """Yield readings with joint values of other rows: shifted, one column or all, reversed, in the order of texts."""
+    count, robot = len(points.row), points.robot
     for k, (by, low, back) in product(range(1, min(3, count - 6) + 1), SLIPPED):
         rows = f"{k} row{'s' * (k > 1)}"
         what = f"measured values {rows} too {low} in the table"
         remedy = f"move the measured values {rows} {back}, against the joint values"
-        yield Misreading(what, remedy, partial(_slipped, slice(None), -k * by))
+        yield Misreading(what, remedy, partial(_slipped, ..., -k * by))
     for i, (by, low, back) in product(range(robot.dof), SLIPPED):
         what = f"the values of joint {robot.joint(i)} one row too {low} in the table"
-        yield Misreading(what, f"move the column of joint {robot.joint(i)} one row {back}", partial(_slipped, i, by))
+        remedy = f"move the column of joint {robot.joint(i)} one row {back}"
+        yield Misreading(what, remedy, partial(_slipped, (..., i), by))
+    for by, low, back in SLIPPED if points.q.ndim > 2 and points.q.shape[1] > 1 else ():
+        what = f"the joint values of the second point one row too {low} in the table"
+        yield Misreading(what, f"move their columns one row {back}", partial(_slipped, np.s_[:, 1], by))
     by_text = np.array(sorted(range(count), key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
     for what, how, order in (
