@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -269,6 +270,18 @@ def test_rows_of_an_instrument_that_moved_are_named() -> None:
     assert accepted.verdict == "inconclusive"
     assert accepted.reasons[-1].endswith("If the instrument was moved since the calibration, use --register.")
     assert not ro.use.validate(result, moved, register=True).remarks[1:]
+
+
+@pytest.mark.parametrize("register", [False, True])
+def test_the_row_from_which_on_an_instrument_moved_is_named(register: bool) -> None:
+    """Calibrations name it; `validate` said that all rows are displaced as a whole."""
+    instance = ro.load("position")
+    result = ro.calibrate(instance.problem)
+    (block,) = instance.validation.blocks
+    steps = np.outer(np.arange(40) >= 24, [0.0013, -0.0004, 0.0002])
+    moved = replace(instance.validation, blocks=(replace(block, y=block.y + steps),))
+    said = ro.use.validate(result, moved, register).mistake
+    assert re.match(r"Likely: from row c2[345] on the points are 1\.[34]\d? mm off the fit .* a changed base", said)
 
 
 @pytest.mark.parametrize("name", ["position", "pose"])
