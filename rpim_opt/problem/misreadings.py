@@ -34,7 +34,7 @@ from rpim_opt.problem.registration.points import (
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, robots
-from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.mdh import Robot, numbered
 
 BETTER = 0.2  # another reading of the data is reported when it leaves less than this part of the position error
 RARE = 1e-6  # probability with which chance may explain what is reported
@@ -197,6 +197,12 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
             sum_of = f"q{i + 1} {'plus' if factor > 0 else 'minus'} {size}q{j + 1}"
             what = f"joint {robot.joint(i)} coupled to joint {robot.joint(j)} ({sum_of})"
             yield _joints(what, coupling(robot.joint_map @ M), M)
+    followers = sorted({*range(len(robot.mdh))} - {*robot.leading})
+    for i, j, factor in product(followers, range(robot.dof), (-1, 0, 1)):
+        to_model = robot.joint_map.copy()
+        to_model[i, j] = factor
+        what = f"joint {numbered(i, robot.joint_names)} following joint {robot.joint(j)} {factor} times"
+        yield _with_robot(what, coupling(to_model), replace(robot, joint_map=to_model))
 
 
 def signs(joint_map: Array) -> Array:
