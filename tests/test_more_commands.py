@@ -80,6 +80,19 @@ def test_touches_are_designed_at_a_point(monkeypatch: pytest.MonkeyPatch, capsys
     assert "x,y,z [mm]" in capsys.readouterr().err
 
 
+def test_touches_without_a_point_are_designed_at_a_place_that_was_touched(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    """The one nearest to the middle of all, socket E; nominal errors of the robot are 6 mm, sockets 150 mm apart."""
+    asked = ["design", "contact", "--count", "3", "--candidates", "8", "--criterion", "D", "--json"]
+    assert run(monkeypatch, *asked) == 0
+    columns = json.loads(capsys.readouterr().out)["configurations"]
+    q = np.radians([[float(v) for v in columns[f"q{i}_deg"]] for i in range(1, 8)]).T
+    flange = ro.robot.forward_kinematics(ro.load("contact").problem.robot, q)
+    tip = flange[:, :3, 3] + 0.12 * flange[:, :3, 2]
+    assert np.linalg.norm(tip - [0.55, 0.0, 0.35], axis=1).max() < 0.01
+
+
 def test_two_logs_are_read_alike_by_every_command_that_takes_measurements(
     monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Any
 ) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.curve import menger
 from rpim_opt.convex.rules.folds import held_out_error
 from rpim_opt.convex.rules.selection import weight_grid
@@ -242,13 +243,21 @@ def test_a_search_by_holding_out_says_its_edges(values: str, edge: str) -> None:
         assert "largest weight of the grid is best" in chosen.note
 
 
-def test_two_steps_are_those_of_the_paper() -> None:
-    chosen = ro.two_step(PROGRAM)
-    coarse = np.geomspace(ro.l_curve(PROGRAM).weight, 1e-10 * ro.l_curve(PROGRAM).weight, 30)
-    norms = np.sqrt([e.loss for e in PROGRAM.path(coarse)])
+def of_few() -> Program:
+    """Return a program of twelve configurations, whose residual falls below the corner of its L-curve, too."""
+    problem = ro.load("position").problem.on(ro.load("position").problem.data.take(np.arange(12)))
+    return ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
+
+
+@pytest.mark.parametrize(("program", "steps"), [(PROGRAM, 0), (of_few(), 3)], ids=["at the corner", "below it"])
+def test_two_steps_are_those_of_the_paper(program: Program, steps: int) -> None:
+    chosen = ro.two_step(program)
+    coarse = np.geomspace(ro.l_curve(program).weight, 1e-10 * ro.l_curve(program).weight, 30)
+    norms = np.sqrt([e.loss for e in program.path(coarse)])
     level = next(w for k, w in enumerate(coarse[:-1]) if norms[k + 1] >= 0.99 * norms[k])
+    assert level == coarse[steps]
     assert chosen.weights == pytest.approx(level * np.linspace(0.563, 5.063, 10) / 3.063, rel=1e-9)
-    assert chosen.score == pytest.approx(held_out_error(PROGRAM)(chosen.weights), rel=1e-9)
+    assert chosen.score == pytest.approx(held_out_error(program)(chosen.weights), rel=1e-9)
     k = int(np.argmin(chosen.score))
     assert chosen.weight == chosen.weights[k]
     assert chosen.interior == (0 < k < 9)

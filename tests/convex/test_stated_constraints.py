@@ -283,6 +283,15 @@ def test_a_file_keeps_statements_and_their_prices(tmp_path: Path) -> None:
     assert ro.load_result(tmp_path / "script.json").shadow_prices == script.shadow_prices
 
 
+def test_a_file_keeps_the_places_of_a_statement(tmp_path: Path) -> None:
+    """A box in the robot's base stays a box, and joint values stay joint values."""
+    demands = tuple(ro.constraints.parse(f"move at most 0.5 mm: {place}", PLACES) for place in PLACES)
+    result = calibrated("move at most 0.3 mm: home")
+    stated = replace(result, formulation=replace(result.formulation, constraints=demands))
+    ro.store.save_result(stated, tmp_path / "result.json")
+    assert ro.load_result(tmp_path).formulation.constraints == demands
+
+
 def test_parameters_that_are_not_identified_are_nominal() -> None:
     """d4 is 302 mm where it is not identified: the sum says all of a3."""
     problem = ro.load("position").problem

@@ -23,6 +23,16 @@ def test_good_data_raise_no_suspicion(name: str) -> None:
     assert "parameter combinations are identifiable" in str(found)
 
 
+def test_neither_do_poses_and_positions_of_one_reflector() -> None:
+    """Half of the rows are without orientations, as an instrument measures that sees the reflector's centre alone."""
+    poses = ro.load("pose").problem
+    later = ro.Dataset.of(poses.data.q[15:], poses.data.blocks[0].y[15:, :3], 5e-5)
+    both = ro.Dataset.together([poses.data.take(np.arange(15)), later], ["poses", "positions"])
+    found = inspect(poses.on(both))
+    assert found.judgement == ()
+    assert "parameter combinations are identifiable" in str(found)
+
+
 def changed(name: str, q=lambda q: q, y=lambda y: y) -> ro.CalibrationProblem:
     problem = ro.load(name).problem
     blocks = tuple(replace(b, q=q(b.q.copy()), y=y(b.y.copy())) for b in problem.data.blocks)
