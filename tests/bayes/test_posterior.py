@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cvxpy as cp
 import numpy as np
 import pytest
 
@@ -93,6 +94,17 @@ def test_noise_and_inflation_widen_it() -> None:
     assert np.abs(plain.rows) == pytest.approx(2 * np.abs(found.rows), rel=1e-9)
     assert np.abs(plain.rows) == pytest.approx(3 * np.abs(loud.rows), rel=1e-9)  # 3 standard deviations, not variances
     assert np.abs(found.rows) == pytest.approx(6 * np.abs(inflated.rows), rel=1e-9)
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5])
+def test_it_is_as_wide_with_a_part_of_loss_and_penalty(share: float) -> None:
+    """That the objective is halved changes neither the minimum nor what is known of it."""
+    huber = ro.huber(1.5)
+    stated = ro.Formulation("a part", loss=lambda r: share * huber(r), penalty=cp.sum_squares)
+    result = ro.calibrate(PROBLEM, stated, weight=share)
+    rows = Prior.from_result(result).stated(PROBLEM.parameters).rows
+    widths = np.sqrt(np.diag(np.linalg.inv(rows.T @ rows))) * FREE.scale
+    assert widths == pytest.approx(np.sqrt(np.diag(result.covariance)), rel=1e-6)
 
 
 def test_it_is_as_wide_as_the_result_says() -> None:
