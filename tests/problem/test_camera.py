@@ -286,6 +286,15 @@ def test_mistakes_are_found_in_views(change, said: str) -> None:
     assert ";" not in found.remedy  # one mistake, and not others that a lens makes plausible
 
 
+def test_a_reversed_joint_is_found_in_eight_views() -> None:
+    problem = ro.load("camera").problem
+    data = problem.data.configurations(8, 0)
+    turned = replace(data.blocks[0], q=data.blocks[0].q * [1, 1, -1, 1, 1, 1])
+    found = better_interpretation(problem.on(replace(data, blocks=(turned,))))
+    assert found is not None
+    assert found.remedy == "write sign = -1 for joint 3 in robot.toml"
+
+
 @pytest.mark.slow
 def test_good_views_are_read_as_they_are() -> None:
     assert better_interpretation(ro.load("camera").problem) is None
