@@ -20,7 +20,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.words import contact_remarks
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.design import Observability, observe
-from rpim_opt.problem.diagnosis import all_q, beyond_limits, hardly_moved
+from rpim_opt.problem.diagnosis import all_q, better_interpretations, beyond_limits, hardly_moved
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.frames import fitted_frames
@@ -194,18 +194,20 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None, prio
         which = repeated(block)
         again = np.flatnonzero(np.bincount(which) > 1)
         groups += [tuple(data.label[i] for i in block.row[which == k]) for k in again]
+    fit, failed = None, list[str]()
     try:
         fit = calibrate(problem, prior=prior)
         fit = replace(fit, record=replace(fit.record, validation=validation))
-    except (InputError, NoSolutionFound, np.linalg.LinAlgError):
-        fit = None
+    except (InputError, NoSolutionFound, np.linalg.LinAlgError) as error:
+        failed = [f"The quick fit has no result: {error}"]
+        failed += [f"Likely: {text}" for text in better_interpretations(problem)]
     # all are identified again, with frames where they were fitted
     whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
     return Inspection(
         problem=problem,
         residual=fitted.errors(x),
         repeated=tuple(groups),
-        warnings=tuple(_ranges(problem)),
+        warnings=(*_ranges(problem), *failed),
         observability=observe(whole),
         contact=tuple(contact_remarks(problem)),
         fit=fit,
