@@ -45,8 +45,6 @@ BESIDE = 0.05  # distance [m] of a stated position from the joint values beside 
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
 FIRST = np.array([1, 1, 1, 1e-3, 1e-3, 1e-3])  # weights [m/rad] of an error with which the position comes first
 STILL = 1e-9  # weight [m^2/rad^2] of the joints' motion there: no singular wrist swings to keep an orientation
-KEPT = np.array([1, 1, 1, 1e-4, 1e-4, 1e-4])  # `REACHED` is 1e-7 m, and 1 mrad where orientations are kept
-POSITION = np.array([1.0, 1, 1, 0, 0, 0])  # remaining error where orientations are not corrected
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
 BANK, TRIALS = 2000, 12  # configurations among which starts of a pose without one are sought; how many it tries
 NULL_SPACE_WEIGHT = 1e-10  # weight of a correction that moves nothing, relative to the largest squared singular value
@@ -70,16 +68,16 @@ class Compensation:
     identified parameters, those of the base included, their Jacobian J and the repeatability R; infinite without C.
     ``orientation_std`` (N,) [rad] is that of the orientation, with R where orientations were measured.
 
-    ``status`` of a row is ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (by a joint
-    limit), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or ``"near singular"`` (the
-    correction would be too large, and was damped); ``"above the limit"`` where the position error and its expanded
-    uncertainty (k = 2) together exceed ``limit`` [m]. An ``"ok"`` row is ``"extrapolated"`` beyond the measured joint
-    ranges; ``outside`` are all rows there. ``note`` says why a robot is not delivered, how joints count whose signs or
-    zeros were estimated, and of which session the instrument's frame is; ``point`` which point is moved, and why
-    orientations are not corrected; ``source`` names the calibration. ``beside`` (N,) [m] is how far a stated position
-    is from that of the nominal robot at the joint values stated beside it, NaN where there are none. ``after_motion``
-    is the RMS of uncorrected position errors [m] that one motion of all targets leaves, NaN for fewer than `MOVED` of
-    them or targets on a line; ``std_after_motion`` that of standard uncertainties.
+    ``status`` of a row is ``"ok"`` (at most 0.1 um and 0.1 urad are left, 0.1 mrad where orientations are kept),
+    ``"limited"`` (by a joint limit), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found)
+    or ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where the position
+    error and its expanded uncertainty (k = 2) together exceed ``limit`` [m]. An ``"ok"`` row is ``"extrapolated"``
+    beyond the measured joint ranges; ``outside`` are all rows there. ``note`` says why a robot is not delivered, how
+    joints count whose signs or zeros were estimated, and of which session the instrument's frame is; ``point`` which
+    point is moved, and why orientations are not corrected; ``source`` names the calibration. ``beside`` (N,) [m] is how
+    far a stated position is from that of the nominal robot at the joint values stated beside it, NaN where there are
+    none. ``after_motion`` is the RMS of uncorrected position errors [m] that one motion of all targets leaves, NaN for
+    fewer than `MOVED` of them or targets on a line; ``std_after_motion`` that of standard uncertainties.
     """
 
     robot: Robot
@@ -366,20 +364,16 @@ def _less_certain(reflector: _Cell, found: Compensation, targets: Targets) -> st
 def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool | None) -> tuple[dict[str, Any], str]:
     """Return the fields of all rows, and why orientations are not corrected, where they are not."""
 
-    def begun(start: int) -> _Begun:
-        return cell.begun(Targets._make(None if each is None else each[start : start + BLOCK] for each in targets))
+    def corrected(start: int) -> dict[str, Array]:
+        some = Targets._make(None if each is None else each[start : start + BLOCK] for each in targets)
+        return cell.corrected(some, largest, orientation)
 
-    parts = on_all_cores(begun, range(0, len(targets.label), BLOCK))
-    ended = on_all_cores(lambda part: cell.ended(part, largest, orientation), parts)
-    fields: dict[str, Any] = {name: np.concatenate([each[name] for each in ended]) for name in ended[0]}
+    parts = on_all_cores(corrected, range(0, len(targets.label), BLOCK))
+    fields: dict[str, Any] = {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
     kept = np.count_nonzero(~fields.pop("turning"))
-    known = "its correction would be smaller than its standard uncertainty"
-    if cell.fit_covariance is None:
-        known = "its uncertainty is unknown"
-    rows = f"{kept} of {len(targets.label)} targets"
+    rows, known = f"{kept} of {len(targets.label)} targets", "its uncertainty is unknown, or larger than its correction"
     why = f" Orientation of {rows} is not corrected: {known}; --orientation corrects it anyway." if kept else ""
-    there = np.concatenate([part.reached[:, :3] for part in parts])
-    targets_at = there + np.concatenate([(part.before - part.missed)[:, :3] for part in parts])
+    there, targets_at = fields.pop("there"), fields.pop("targets_at")
     if len(there) >= MOVED:
         with suppress(InputError):
             left = targets_at - transformed(register(there, targets_at), there)
@@ -424,20 +418,6 @@ def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
 
 
 # --- the controller's robot beside the identified one ------------------------------------------------------
-
-
-class _Begun(NamedTuple):
-    """Commands of the controller for some targets before they are corrected, and where they bring both robots."""
-
-    targets: Targets
-    load: Array  # what the joints of the model bear, as `Arm.at` takes it
-    commands: Array  # (N, dof)
-    wanted: Array  # poses (N, c)
-    missed: Array  # error (N, k) of the controller's robot
-    reached: Array  # pose (N, c) of the identified robot,
-    before: Array  # its error (N, k)
-    J: Array  # and its Jacobian (N, k, dof)
-    beside: Array  # as in a `Compensation`
 
 
 class _Cell(NamedTuple):
@@ -514,8 +494,12 @@ class _Cell(NamedTuple):
             own, None if result.no_intervals else result.fit_covariance, marker, noise, result.variance_factor, point,
         )  # fmt: skip
 
-    def begun(self, targets: Targets) -> _Begun:
-        """Return the nominal commands for some targets, and the errors of both robots there."""
+    def corrected(self, targets: Targets, largest: float, orientation: bool | None) -> dict[str, Array]:
+        """Return the fields of a `Compensation` for some targets, and which orientations are ``turning`` (N,).
+
+        ``there`` (N, 3) are the positions of uncorrected commands, ``targets_at`` (N, 3) where the nominal robot has
+        them.
+        """
         _, q, poses, torque, payload = targets
         N = len(targets.label)
         borne = [] if torque is None else [torque @ np.linalg.inv(self.robot.joint_map)]
@@ -530,12 +514,8 @@ class _Cell(NamedTuple):
             missed = self.nominal.at(commands, load, poses)[1]
             if q is not None:
                 beside = self.norms(self.nominal.at(q, load, poses)[1])[0]
-        return _Begun(targets, load, commands, target, missed, *self.identified.at(commands, load, target), beside)
-
-    def ended(self, begun: _Begun, largest: float, orientation: bool | None) -> dict[str, Array]:
-        """Return the fields of a `Compensation` for some targets, and whether it is ``turning`` each (N,)."""
-        targets, load, commands, target, missed, pose_before, before, J, beside = begun
-        N, k, n = J.shape
+        pose_before, before, J = self.identified.at(commands, load, target)
+        k, n = J.shape[1:]
         counts = np.broadcast_to(attainable(J), (N, k, k))
         reached = self._reached(missed, counts)
         choice = orientation is None and self.kind is pose
@@ -543,7 +523,7 @@ class _Cell(NamedTuple):
         if choice:
             turning[:, 0] = self.norms(before)[1] >= self.uncertainty(commands, targets)[1]
         wanted = np.where(turning | (np.arange(target.shape[1]) < 3), target, pose_before)
-        due = np.where(reached[:, None], before - missed, 0.0) * np.where(turning, 1.0, POSITION[:k])
+        due = np.where(reached[:, None] & (turning | (np.arange(k) < 3)), before - missed, 0.0)
         W = counts * np.where(turning, 1.0, FIRST[:k])[:, None]
         # P = V diag(p) V' of W J = U diag(s) V', see `compensate`
         U, s, Vt = np.linalg.svd(W @ J, full_matrices=True)
@@ -564,10 +544,10 @@ class _Cell(NamedTuple):
             there = load[first], wanted[first], commands[first], limits[:, first], counts[first] * FIRST, still[None]
             corrected[first], left[first], active[first] = nearest(self.identified, *there)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        met = self._reached(left * np.where(turning, 1.0, KEPT[:k]), counts)
-        cases = {"ok": met, "limited": at_limit, UNREACHABLE: ~reached}
+        cases = {"ok": self._reached(left, W), "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status, "turning": turning}
+        fields |= {"there": pose_before[:, :3], "targets_at": pose_before[:, :3] + (before - missed)[:, :3]}
         fields["position_before"], fields["orientation_before"] = self.norms(before)
         error = self.identified.at(corrected, load, target)[1]
         fields["position_error"], fields["orientation_error"] = self.norms(error)
