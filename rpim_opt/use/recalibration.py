@@ -29,6 +29,7 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.quadratic import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier, HeldOut, Record
+from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.multi_robot import identifying_sessions
@@ -128,7 +129,7 @@ class Update:
     ``errors`` [mm] are those of both calibrations on the readings that were not left out, and on rows held out of the
     previous one, where nothing was released. ``registered`` is whether the instrument or the base moved so far that the
     base was registered again; else empty. ``undetermined`` are the frames that were released, or are new, and that the
-    new rows determine worse than their prior does.
+    new rows determine worse than their prior does, and changes below twice their standard deviation.
     """
 
     result: Calibration
@@ -153,16 +154,9 @@ class Update:
         return self.after.likely
 
     @property
-    def unsure(self) -> tuple[str, ...]:
-        """Parameters and frames whose change is smaller than twice its standard deviation."""
-        moved = {each.name: abs(each.change) > 2 * each.std for each in self.moved if isinstance(each, Moved)}
-        sizes = {c.name: [moved[name] for name in c.members if name in moved] for c in self.changes}
-        return tuple(name for name, sure in sizes.items() if sure and not any(sure))
-
-    @property
     def delivered(self) -> bool:
         """Whether all is explained and determined, and the calibration is delivered."""
-        return self.explained and not self.unsure and not self.undetermined and self.result.verdict.delivered
+        return self.explained and not self.undetermined and self.result.verdict.delivered
 
     @cached_property
     def lacking(self) -> str:
@@ -182,7 +176,6 @@ class Update:
             "causes": [cause._asdict() for cause in self.causes],
             "readings": self.readings,
             "undetermined": self.undetermined,
-            "unsure": self.unsure,
             "errors": self.errors,
             "lacking": self.lacking,
             "converged": self.result.converged,
@@ -221,13 +214,8 @@ class Update:
             lines.append(f"After these changes: {self.after}.")
         if self.undetermined:
             lines.append(
-                f"The new rows do not determine the pose of {joined(self.undetermined)}: measure at least three "
-                "configurations with the reflector's positions not on a line, or omit --reset if nothing was moved."
-            )
-        if self.unsure:
-            lines.append(
-                f"The new rows do not determine the change of {joined(self.unsure)}, which is smaller than twice its "
-                "standard deviation: measure more configurations."
+                f"The new rows do not determine {joined(self.undetermined)}: measure more configurations, at least "
+                "three with the reflector's positions not on a line, or omit --reset if nothing was moved."
             )
         for name, of in self.errors.items():
             was, now = (f"{of[when]['rms_mm']:.4f} mm" for when in ("before", "after"))
@@ -330,6 +318,8 @@ def update(
     elsewhere = " ".join(filter(None, [elsewhere, said]))
     updated = replace(updated, record=_carried_on(result.record, last, source))
     moved = _moved(result, updated, released, changes)
+    unclear = {each.name for each in moved if isinstance(each, Moved) and abs(each.change) < 2 * each.std}
+    vague += tuple(cause.name for cause in changes if unclear.issuperset(cause.members))
     return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
 
 
@@ -420,7 +410,10 @@ def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple
     """Return the sentences of `displacement`, or the change of the robot that leaves clearly less of chi-squared.
 
     That is less by `AS_GOOD`, of new measurements and prior together, than after registration and with another base.
+    What changed between them comes first.
     """
+    if between := _between_rows(result, data):
+        return between, ""
     moved = displacement(result, data, held)
     place = registration(result.problem.parameters.free, data)
     placed_by = {place + axis for axis in FRAME} <= set(result.problem.parameters.free.names)
@@ -440,6 +433,22 @@ def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple
         f"{fit.equations - len(best.members)}, and a motion of the instrument or the base {three_digits(motion)} of "
         f"{fit.equations - len(base.members)}. Recalibrate by `update`; --register would hide the change."
     ), ""
+
+
+def _between_rows(result: Calibration, data: Dataset) -> str:
+    """Say what changed, or is otherwise, from some measurements to others, as of a calibration's; empty elsewhere."""
+    if not result.problem.keeps_rows or len(result.problem.arms) > 1:
+        return ""
+    with suppress(InputError):  # what all rows share is no change; few positions, or on a line, register nothing
+        data = registered(result, data)[0]
+    held = held_out_errors(result, data)
+    if np.count_nonzero(held.sigmas > held.allowed) < diagnosis.FEWEST:  # outliers
+        return ""
+    problem = with_data(result, data)
+    residuals = diagnosis.shown_by_residuals(problem, previous_deviations(result, problem))
+    problem = replace(problem, robots=result.robot)
+    said = diagnosis.first(residuals, diagnosis.other_places(problem), diagnosis.other_rows(problem))
+    return f"Likely: {said[0]}" if said else ""
 
 
 def _changes(result: Calibration, data: Dataset) -> tuple[tuple[Cause, ...], Fit]:

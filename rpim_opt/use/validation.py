@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array, statistics
-from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import coverage_text, registered
+from rpim_opt.calibration.held_out import coverage_text
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage, unregistered
 from rpim_opt.calibration.verdict import implausible, misread, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
-from rpim_opt.problem.diagnosis import FEWEST, first, other_places, other_rows, shared_rows, shown_by_residuals
-from rpim_opt.use.recalibration import moved_or_changed, previous_deviations, with_data
+from rpim_opt.problem.diagnosis import shared_rows
+from rpim_opt.use.recalibration import moved_or_changed
 from rpim_opt.use.sessions import registered_again
 
 
@@ -157,10 +155,8 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
     held = held_out_errors(result, data)
     touched = touch_errors(data, held.nominal, held.error)
     remarks += shared_rows(problem.data, data)
-    mistake = misread(result, data) or _between_rows(result, data)
-    if not mistake:
-        mistake, hint = moved_or_changed(result, data, held)
-        remarks += [hint] if hint else []
+    moved, hint = moved_or_changed(result, data, held)
+    remarks += [hint] if hint else []
     if not result.verdict.delivered:
         remarks.append(f"The calibration is not delivered: {' '.join(result.verdict.reasons)}")
     if touched:
@@ -172,22 +168,6 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
         outside=result.outside(data),
         touched=touched,
         remarks=tuple(remarks),
-        mistake=mistake or implausible(result, held),
+        mistake=misread(result, data) or moved or implausible(result, held),
         no_intervals=result.no_intervals or unregistered(result, data, held),
     )
-
-
-def _between_rows(result: Calibration, data: Dataset) -> str:
-    """Say what changed, or is otherwise, from some measurements to others, as of a calibration's; empty elsewhere."""
-    if not result.problem.keeps_rows or len(result.problem.arms) > 1:
-        return ""
-    with suppress(InputError):  # what all rows share is no change; few positions, or on a line, register nothing
-        data = registered(result, data)[0]
-    held = held_out_errors(result, data)
-    if np.count_nonzero(held.sigmas > held.allowed) < FEWEST:  # outliers
-        return ""
-    problem = with_data(result, data)
-    identified = replace(problem, robots=result.robot)
-    residuals = shown_by_residuals(problem, previous_deviations(result, problem))
-    said = first(residuals, other_places(identified), other_rows(identified))
-    return f"Likely: {said[0]}" if said else ""

@@ -209,12 +209,15 @@ def test_a_change_that_is_smaller_than_its_standard_deviation_is_not_delivered(m
     found = ro.use.update(first, robot.after.take(np.arange(3)), reset=("base_*",))
     assert found.explained
     assert [cause.name for cause in found.changes] == ["tool"]
-    assert found.unsure == ("tool",)
+    assert found.undetermined == ("tool",)
     assert not found.delivered
     ro.store.save_result(first, tmp_path)
     (tmp_path / "few.csv").write_text(table(robot.after.take(np.arange(3))))
     assert run(monkeypatch, "update", str(tmp_path), str(tmp_path / "few.csv"), "--reset", "base_*") == 1
-    assert "The new rows do not determine the change of tool, which is smaller than" in capsys.readouterr().out
+    assert (
+        "The new rows do not determine tool: measure more configurations, at least three with"
+        in capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize(("rows", "undetermined"), [(2, ("base",)), (3, ())])
@@ -228,7 +231,7 @@ def test_a_base_that_the_new_rows_do_not_determine_is_named(
     (tmp_path / "few.csv").write_text(table(few))
     code = run(monkeypatch, "update", str(tmp_path), str(tmp_path / "few.csv"), "--reset", "base_*")
     assert code == bool(undetermined)
-    said = "do not determine the pose of base: measure at least three configurations" in capsys.readouterr().out
+    said = "do not determine base: measure more configurations, at least" in capsys.readouterr().out
     assert said == bool(undetermined)
 
 
