@@ -45,6 +45,7 @@ BESIDE = 0.05  # distance [m] of a stated position from the joint values beside 
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
 FIRST = np.array([1, 1, 1, 1e-3, 1e-3, 1e-3])  # weights [m/rad] of an error with which the position comes first
 STILL = 1e-9  # weight [m^2/rad^2] of the joints' motion there: no singular wrist swings to keep an orientation
+KEPT = np.array([1, 1, 1, 1e-4, 1e-4, 1e-4])  # `REACHED` is 1e-7 m, and 1 mrad where orientations are kept
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
 BANK, TRIALS = 2000, 12  # configurations among which starts of a pose without one are sought; how many it tries
 NULL_SPACE_WEIGHT = 1e-10  # weight of a correction that moves nothing, relative to the largest squared singular value
@@ -68,7 +69,7 @@ class Compensation:
     identified parameters, those of the base included, their Jacobian J and the repeatability R; infinite without C.
     ``orientation_std`` (N,) [rad] is that of the orientation, with R where orientations were measured.
 
-    ``status`` of a row is ``"ok"`` (at most 0.1 um and 0.1 urad are left, 0.1 mrad where orientations are kept),
+    ``status`` of a row is ``"ok"`` (at most 0.1 um and 0.1 urad are left, 1 mrad where orientations are kept),
     ``"limited"`` (by a joint limit), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found)
     or ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where the position
     error and its expanded uncertainty (k = 2) together exceed ``limit`` [m]. An ``"ok"`` row is ``"extrapolated"``
@@ -544,7 +545,8 @@ class _Cell(NamedTuple):
             there = load[first], wanted[first], commands[first], limits[:, first], counts[first] * FIRST, still[None]
             corrected[first], left[first], active[first] = nearest(self.identified, *there)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        cases = {"ok": self._reached(left, W), "limited": at_limit, UNREACHABLE: ~reached}
+        met = self._reached(left * np.where(turning, 1.0, KEPT[:k]), counts)
+        cases = {"ok": met, "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status, "turning": turning}
         fields |= {"there": pose_before[:, :3], "targets_at": pose_before[:, :3] + (before - missed)[:, :3]}
