@@ -768,7 +768,10 @@ BAD = {
     "all held out": ([*NEW, "--hold-out", "1"], ["--hold-out", "between 0 and 1"]),
     "bad validation": ([*NEW, "--validation", "broken.csv"], ["broken.csv", "row 2", "'inf'"]),
     "another robot's data": ([*NEW[:3], "panda", *NEW[4:]], ["measured.csv", "no column for 'q7'"]),
-    "several points": ([*NEW[:5], "points.csv", *NEW[6:]], ["column 'x2', another point", "marker"]),
+    "several points": ([*NEW[:5], "points.csv", *NEW[6:]], ["column 'x2', another point or reading", "marker"]),
+    "a turning joint in mm": (
+        [*NEW[:5], "sliding.csv", *NEW[6:]], ["'joint_6 [mm]' (joint 6) in mm", 'another type of the joint']
+    ),
     "the same twice": ([*NEW[:5], "twice.csv", *NEW[6:]], ["columns 'x1' and 'X' for x_m"]),
     "rotation vector?": ([*NEW[:5], "turns.csv", *NEW[6:]], ["column 'rx', either angles or a rotation vector"]),
     "no rows": ([*NEW[:5], "empty.csv", *NEW[6:]], ["empty.csv", "a header and no rows"]),
@@ -805,6 +808,7 @@ def desk(cell: Path, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (tmp_path / "result.json").rename(tmp_path / "results" / "result.json")
     header, rows = table(cell / "measured.csv")
     write_csv(tmp_path / "points.csv", ["x1", "y1", "z1", "x2", *header[4:]], rows)
+    write_csv(tmp_path / "sliding.csv", [*header[:-1], "joint_6 [mm]"], rows)
     write_csv(tmp_path / "turns.csv", [*header, "rx", "ry", "rz"], np.hstack([rows, rows[:, :3]]))
     write_csv(tmp_path / "twice.csv", [*header, "X"], np.hstack([rows, rows[:, :1]]))
     write_csv(tmp_path / "joints.csv", header[3:], rows[:, 3:])

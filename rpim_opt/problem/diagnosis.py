@@ -63,6 +63,7 @@ ANOTHER = 0.01  # joint movement [rad, m] after which no point is measured again
 FILLED = 1e-3  # a point that is at least so far from the one before [m] is another one
 COPIES = 0.2  # part of the rows that may repeat others
 MOST_ROUNDS = 20  # of fitting one joint's values
+COUPLED = 0.004  # ratio below which a coupling of two joints is not made by gears: teeth of one over those of another
 LOADS, SINGULAR = 0.6, 1e-9
 """What two loads leave of the residuals at most; part of the squares below which columns are the same."""
 COMPUTED = "were they computed, not measured? Leave them out ([exclude])."
@@ -313,7 +314,7 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
     """Report rounding of joint or measured values that explains the RMS error [m] of a fit, or what it excludes."""
     alike = list(roundings(problem, error, ALIKE[1]))
     yield from alike
-    steps = [each for each in _roundings(problem) if each.step and each.made > ALIKE[1] * error and not alike]
+    steps = [each for each in every_rounding(problem) if each.step and each.made > ALIKE[1] * error and not alike]
     for each in steps[-1:]:
         yield (
             f"joint values are multiples of {each.step}, but errors of {three_digits(1e3 * error)} mm are smaller than "
@@ -324,7 +325,7 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
 
 def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterator[str]:
     """Report rounding of joint or measured values, if the RMS error [m] of a fit is less than so many times its own."""
-    for each in _roundings(problem):
+    for each in every_rounding(problem):
         if each.least * each.made < error < most * each.made:
             yield (
                 f"{each.what}: that alone contributes {three_digits(1e3 * each.made)} mm, the residual RMS is "
@@ -332,7 +333,7 @@ def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterato
             )
 
 
-def _roundings(problem: CalibrationProblem) -> Iterator[Rounding]:
+def every_rounding(problem: CalibrationProblem) -> Iterator[Rounding]:
     """Yield roundings of joint and measured values that are there, whatever they explain."""
     turning = np.array(problem.robot.joint_dimensions) == "angle"
     angles = all_q(problem.data)[:, turning]
@@ -1208,6 +1209,8 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
             sign = signs(robot.joint_map)
             part = sign[i] * factor * sign[j]
             what = f"joint {one} is coupled to joint {other} (q{i + 1} {part:+.4f} q{j + 1})"
+            if abs(part) < COUPLED:
+                return what, "no gears have so small a ratio: have bearings, hoses and mounting of both joints checked"
         return what, coupling(to_model)
 
     for i, j in product(of_zero, range(q.shape[1])):

@@ -197,8 +197,9 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
             sum_of = f"q{i + 1} {'plus' if factor > 0 else 'minus'} {size}q{j + 1}"
             what = f"joint {robot.joint(i)} coupled to joint {robot.joint(j)} ({sum_of})"
             yield _joints(what, coupling(robot.joint_map @ M), M)
-    followers = sorted({*range(len(robot.mdh))} - {*robot.leading})
-    for i, j, factor in product(followers, range(robot.dof), (-1, 0, 1)):
+    own = set(zip(robot.leading, range(robot.dof), strict=True))
+    coupled = product(range(len(robot.mdh)), range(robot.dof)) if len(robot.mdh) > robot.dof else ()
+    for (i, j), factor in product(sorted({*coupled} - own), (-1, 0, 1)):
         to_model = robot.joint_map.copy()
         to_model[i, j] = factor
         what = f"joint {numbered(i, robot.joint_names)} following joint {robot.joint(j)} {factor} times"
@@ -243,9 +244,10 @@ def _of_positions(points: Points) -> Iterator[Misreading]:
             remedy = f"multiply column {axis} by {factor:g} or name its unit"
             yield _scaled(f"column {axis} {unit}", remedy, 1 + (factor - 1) * of_axis)
 
-    def from_angles(degrees: float, zenith: bool, points: Points) -> Points:
-        angles = np.radians(degrees * points.y[:, :2] / 1e-3)  # angles were read as millimetres
-        polar = np.column_stack([angles, points.y[:, 2]])
+    def from_angles(degrees: float, zenith: bool, first: int, points: Points) -> Points:
+        y = np.roll(points.y, -first, axis=1)
+        angles = np.radians(degrees * y[:, :2] / 1e-3)  # angles were read as millimetres
+        polar = np.column_stack([angles, y[:, 2]])
         return replace(points, y=from_zenith(polar) if zenith else from_elevation(polar))
 
     def from_cylinder(points: Points) -> Points:
@@ -255,12 +257,14 @@ def _of_positions(points: Points) -> Iterator[Misreading]:
 
     what = "columns x, y, z that are radius, angle and height (cylindrical coordinates)"
     yield Misreading(what, "convert them to x, y, z", from_cylinder)
-    for (degrees, unit), zenith in product(((1.0, ""), (0.9, " in gon")), (False, True)):
-        what = f"columns x, y, z that are azimuth, {'zenith angle' if zenith else 'elevation'} and distance{unit}"
-        remedy = "name the columns azimuth_deg, elevation_deg, distance_mm"
+    for (degrees, unit), zenith, first in product(((1.0, ""), (0.9, " in gon")), (False, True), (0, 1)):
+        angles = f"azimuth, {'zenith angle' if zenith else 'elevation'}"
+        what = f"columns x, y, z that are {f'distance, {angles}' if first else f'{angles} and distance'}{unit}"
+        names = ["azimuth_deg", "elevation_deg", "distance_mm"]
+        remedy = f"name the columns {', '.join([*names[3 - first :], *names[: 3 - first]])}"
         if zenith or unit:
             remedy = f"convert the angles to azimuth and elevation in degrees, and {remedy}"
-        yield Misreading(what, remedy, partial(from_angles, degrees, zenith))
+        yield Misreading(what, remedy, partial(from_angles, degrees, zenith, first))
 
     def from_other_vertical(side: float, points: Points) -> Points:
         level = np.linalg.norm(points.y[:, :2], axis=1, keepdims=True)

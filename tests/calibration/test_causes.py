@@ -577,6 +577,9 @@ def test_computed_positions_are_not_delivered_rounded_either(monkeypatch, capsys
     made(monkeypatch, tmp_path, values(lambda _: y.round(4))(problem))
     assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 1
     assert "computed from this robot" in capsys.readouterr().out
+    # as a controller displays them: 0.01 mm, and 0.001 degrees, which alone make 0.008 mm
+    displayed = joints(lambda q: np.radians(np.degrees(q).round(3)))(values(lambda _: y.round(5))(problem))
+    assert "computed from this robot" in str(ro.calibrate(displayed).verdict)
 
 
 def test_joints_rounded_to_half_degrees_are_named() -> None:
@@ -754,23 +757,31 @@ def test_what_is_in_one_of_two_states_in_every_row_is_named(name: str, size: flo
 def test_a_wrong_coupling_and_wrong_values_of_an_arm_whose_wrist_follows_are_named(tmp_path: Path) -> None:
     """A palletizer has more joints than columns: looking for a wrong column ended in an IndexError."""
     axes = ["d_mm = 800", "alpha_deg = -90\na_mm = 300", "a_mm = 1250", "a_mm = 1400", "alpha_deg = -90\na_mm = 250"]
-    head = (
-        'name = "palletizer"\n'
-        + "coupling = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, -1, {}, 0], [0, 0, 0, 1]]\n"
-    )
     body = "".join(f"[[joint]]\n{axis}\n" for axis in axes)
-    robots = {}
-    for row in ("-1", "0"):
-        (tmp_path / f"{row}.toml").write_text(head.format(row) + body)
-        robots[row] = read_robot(tmp_path / f"{row}.toml")
-    q = np.random.default_rng(2).uniform(-1, 1, (40, 4))
-    y = ro.robot.forward_kinematics(robots["-1"], q)[:, :3] @ [0.1, 0.05, 0.0, 1.0]
-    better = better_interpretation(ro.problem_from(robots["0"], ro.Dataset.of(q, y, mistakes.NOISE)))
-    assert better is not None
-    assert better.what == "joint 4 following joint 3 -1 times"
-    assert "[0, -1, -1, 0]" in better.remedy
-    q[::4, 3] += np.random.default_rng(3).uniform(0.5, 1, 10)
-    (said,) = odd_column(ro.problem_from(robots["-1"], ro.Dataset.of(q, y, mistakes.NOISE)))
+
+    def robot(wrist: list[int]) -> ro.robot.Robot:
+        rows = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], wrist, [0, 0, 0, 1]]
+        (tmp_path / "arm.toml").write_text(f'name = "palletizer"\ncoupling = {rows}\n{body}')
+        return read_robot(tmp_path / "arm.toml")
+
+    def measured(arm: ro.robot.Robot, change: np.ndarray) -> ro.CalibrationProblem:
+        y = ro.robot.forward_kinematics(right, q @ change.T)[:, :3] @ [0.1, 0.05, 0.0, 1.0]
+        return ro.problem_from(arm, ro.Dataset.of(q, y, mistakes.NOISE))
+
+    q, right = np.random.default_rng(2).uniform(-1, 1, (40, 4)), robot([0, -1, -1, 0])
+    over_lower = np.eye(4) - np.outer(np.eye(4)[2], np.eye(4)[1])  # of a controller that counts joint 3 from joint 2
+    cases = [
+        (robot([0, -1, 0, 0]), np.eye(4), "joint 4 following joint 3 -1 times", "[0, -1, -1, 0]"),
+        (robot([0, 0, -1, 0]), over_lower, "joint 3 following joint 2 -1 times", "[0, -1, 1, 0], [0, 0, -1, 0]"),
+    ]
+    for arm, change, what, row in cases:
+        better = better_interpretation(measured(arm, change))
+        assert better is not None
+        assert better.what == what
+        assert row in better.remedy
+    wrong = measured(right, np.eye(4))
+    turned = np.where(np.arange(40) % 4, 0.0, np.random.default_rng(3).uniform(0.5, 1, 40))
+    (said,) = odd_column(joints(lambda own: own + turned[:, None, None] * np.eye(4)[3])(wrong))
     assert "of joint 4 " in said
 
 

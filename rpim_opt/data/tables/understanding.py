@@ -182,7 +182,8 @@ def _readings(
     wanted = {*options.units, *robot.model.columns}
     for name, each in read.items():
         if ANOTHER_POINT.fullmatch(each.stem):
-            raise InputError("the header", f"column '{name}', another point", "one row per point, with a column marker")
+            accepted = "one row per reading, those of several points with a column marker"
+            raise InputError("the header", f"column '{name}', another point or reading", accepted)
         if name.lower() in TURNED and each.stem in names and not (options.rotation or options.units.get("rx")):
             accepted = "roll, pitch, yaw; rx_deg, ry_deg, rz_deg; a quaternion; --rotation vector; --rotation "
             accepted += "'intrinsic xyz'; or --measurement position"
@@ -410,7 +411,9 @@ def _under_our_names(
             continue
         unit, why = _unit(name, read[name], dimensions[stem], units)
         if unit and UNITS[unit].dimension not in dimensions[stem]:
-            accepted = f"one of {' or '.join(dimensions[stem]) or 'no unit'}; units are in the row below the names"
+            accepted = f"one of {' or '.join(dimensions[stem]) or 'no unit'} (in the header or the row below it)"
+            if re.fullmatch(r"q\d+", stem):
+                accepted += ', or another type of the joint in the robot\'s file (type = "prismatic")'
             raise InputError("the header", f"column '{name}' ({meaning(stem)}) in {unit}", accepted)
         new = f"{stem}_{unit}" if unit else stem
         if new in columns:
