@@ -511,11 +511,11 @@ def _odd_values(problem: CalibrationProblem, points: Points) -> Iterator[str]:
             other = replace(points, y=np.where(np.arange(3) == k, fit_points(other).modelled, points.y))
         fitted[f"coordinate {axis}"] = other
     left = {column: misfit(each) for column, each in fitted.items()}
-    first, *others = sorted(left, key=left.__getitem__)
-    if left[first] >= min(BETTER * whole, WRONG):  # free values take up much of any other mistake
+    least = min(left, key=left.__getitem__)
+    if left[least] >= min(BETTER * whole, WRONG):  # free values take up much of any other mistake
         return
-    best = fitted[first]
-    column = " or ".join([first, *(other for other in others if left[other] < 2 * left[first])])
+    best = fitted[least]
+    column = " or ".join(each for each in left if left[each] < 2 * left[least])
     apart = np.abs(np.angle(np.exp(1j * (best.q - points.q)))).max(axis=1) > LEAST_TRAVEL["revolute"] / 2
     apart |= np.abs(best.y - points.y).max(axis=1) > WRONG * points.extent
     if not apart.any():  # small errors of all rows
@@ -524,7 +524,7 @@ def _odd_values(problem: CalibrationProblem, points: Points) -> Iterator[str]:
     if apart.sum() > len(apart) / 2:
         what = f"the values of {column} explain nothing (sorted, copied, shuffled, without signs, another quantity?)"
     yield (
-        f"{what}: with fitted ones the points agree to {three_digits(1e3 * left[first] * points.extent)} mm instead "
+        f"{what}: with fitted ones the points agree to {three_digits(1e3 * left[least] * points.extent)} mm instead "
         f"of {three_digits(1e3 * whole * points.extent)} mm; check its column."
     )
 
