@@ -314,7 +314,7 @@ def required(result: ro.calibration.Calibration, limit: float) -> ro.calibration
 def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) -> None:
     read = Reader(page(required(result_of("position"), limit)))
     words = " ".join(read.words.split())
-    said = "limit 0.07 mm with 95 % confidence at every configuration of the region. Missing: more measurements. The"
+    said = "limit 0.07 mm with 95 % confidence at every configuration of the region. Missing: more measurements. U is"
     if verdict == "Accepted":
         said = "expanded uncertainty of the position that the reflector reaches (U, 95 %) at most"
     assert 0 <= words.index(f"{verdict}: {said}") < words.index("Mean error, nominal")
