@@ -705,8 +705,8 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
     parts = of_sessions(ordered)
     # beside single rows, which may be the ones where something changed
     return first(
-        (f"{text}: check the unit and the column of its values." for text in outside),
         *(chain(diagnosis.single_rows(part), diagnosis.better_interpretations(part, most)) for part in parts),
+        (f"{text}: check the unit and the column of its values." for text in outside),
         _shown_without_outliers(result, ordered),
         diagnosis.rounded(problem, error),
         diagnosis.odd_column(problem) if beyond else (),

@@ -374,7 +374,11 @@ def loose_reflector(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
         (of_joint(4, tenths), r"are rounded to 0.1 deg \(q5\)"),
         (of_joint(2, lambda q: q + 0.009 * (q > 0.6)), r"from q3 = 3\d(\.\d+)? deg on .* a changed zero of joint 3"),
         (of_joint(1, approached), r"backlash, joint 2 by 1\.\d mrad"),
-        (of_joint(4, lambda q: 50 * q), r"joint 5 is -[\d,.]+ to [\d,.]+ deg, but its limits are -360 to 360 deg"),
+        (of_joint(4, lambda q: 50 * q), r"unit or scale: multiply values of joint 5 by 0\.02"),
+        (
+            of_joint(4, lambda q: 20 * np.random.default_rng(3).normal(size=q.shape)),
+            r"joint 5 is -[\d,.]+ to [\d,.]+ deg, but its limits are -360 to 360 deg",
+        ),
     ],
     ids=[
         "noise in a column",
@@ -384,6 +388,7 @@ def loose_reflector(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
         "a joint that falls back",
         "backlash by the angle",
         "another unit of a joint",
+        "another quantity in the place of a joint",
     ],
 )
 def test_what_a_learned_noise_or_gears_would_take_up_is_named(wrong, said: str) -> None:
