@@ -125,7 +125,7 @@ def figure(rows: list[dict[str, Any]]) -> Any:
     for ax, count in zip(np.atleast_1d(found.subplots(1, len(counts), sharey=True)), counts, strict=True):
         table = np.full((len(rules), len(names)), np.nan)
         for row in rows:
-            if row["count"] == count and row["seconds"] is not None:
+            if row["count"] == count and "seconds" in row:
                 table[rules.index(row["method"]), names.index(row["tool"])] = row["seconds"]
         image = ax.imshow(table, norm=LogNorm(1e-3, 1e2), cmap="viridis_r", aspect="auto")
         for i, j in zip(*np.nonzero(np.isfinite(table)), strict=True):
