@@ -194,7 +194,8 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None, prio
         which = repeated(block)
         again = np.flatnonzero(np.bincount(which) > 1)
         groups += [tuple(data.label[i] for i in block.row[which == k]) for k in again]
-    fit, failed = None, list[str]()
+    fit = None
+    failed: list[str] = []
     try:
         fit = calibrate(problem, prior=prior)
         fit = replace(fit, record=replace(fit.record, validation=validation))

@@ -869,9 +869,7 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
     bends, eccentric = np.char.startswith(every, "compliance"), np.char.startswith(every, "ecc_")
     parts["payload"] = (every[bends].tolist(), "did the load at the flange change")
     based = apart & np.isin(every, placed["base"][0])  # a base may move within a session, too
-    whole = problem.identifying(p.identified | bends | eccentric | based)  # a payload shows in them, identified or not
-    there = np.zeros(len(whole.parameters.free))
-    there[p.identified[whole.parameters.identified]] = x
+    whole, there = _with_others(problem, x, bends | eccentric | based)  # a payload shows in them, identified or not
     A = whole.linearize(there).A
     shares = _shares(problem)
     free, named = whole.parameters.free, problem.data.sessions
@@ -915,6 +913,15 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
         slow = "the instrument or the base drifted slowly, though the joint values are in no order"
         still = "temperature? Measure reference points between the rows, or all in a shorter time"
         yield Addition((A[:, base, None] * courses[:, None]).reshape(len(A), -1), lambda c: (slow, still))
+
+
+def _with_others(problem: CalibrationProblem, x: Array, others: np.ndarray) -> tuple[CalibrationProblem, Array]:
+    """Return a problem that identifies other parameters too, and deviations x (n,) with zeros for these."""
+    p = problem.parameters
+    whole = problem.identifying(p.identified | others)
+    there = np.zeros(len(whole.parameters.free))
+    there[p.identified[whole.parameters.identified]] = x
+    return whole, there
 
 
 def _changes(
@@ -1120,11 +1127,8 @@ def two_states(problem: CalibrationProblem, x: Array, most: float = LOADS) -> It
 
     They leave less than a part ``most`` of them.
     """
-    every = np.array(problem.parameters.names)
-    p, bends = problem.parameters, np.char.startswith(every, "compliance")
-    model, whole = problem.with_repeatability(None).linearize(x), problem.identifying(p.identified | bends)
-    there = np.zeros(len(whole.parameters.free))
-    there[p.identified[whole.parameters.identified]] = x
+    model, p = problem.with_repeatability(None).linearize(x), problem.parameters
+    whole, there = _with_others(problem, x, np.char.startswith(np.array(p.names), "compliance"))
     A = whole.with_repeatability(None).linearize(there).A
     if len(model.b) < 3 * len(x):
         return

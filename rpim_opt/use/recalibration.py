@@ -183,6 +183,20 @@ class Update:
             "earlier": [each._asdict() for each in self.result.record.earlier],
         }
 
+    def _alternatives(self) -> str:
+        """Return a sentence on other changes that the readings do not distinguish from those found; empty if none."""
+        # a frame that moved explains as much as the link before or behind it (base_z as d1), with more parameters
+        least = self.changes[0].gain - AS_GOOD if self.changed else np.inf
+        rivals = [c for c in self.causes[1:] if self.changes and (c.probability > RIVAL or c.gain > least)]
+        if not rivals:
+            return ""
+        frames = [cause.name for cause in rivals if cause.kind == "frame"]
+        remedy = "measure more."
+        if frames:
+            remedy = f"if the reflector was exchanged or the instrument moved, use --reset '{frames[0]}_*'."
+        names = joined([cause.name for cause in rivals])
+        return f"These readings do not distinguish this from a change of {names}: {remedy}"
+
     def __str__(self) -> str:
         count = f"{self.readings} readings"
         if self.changes:
@@ -200,16 +214,7 @@ class Update:
         moved = [str(each) for each in self.moved if not (self.registered and each.name.startswith(BASE))]
         if moved:
             lines.append(f"Changed since then: {joined(moved)}.")
-        # a frame that moved explains as much as the link before or behind it (base_z as d1), with more parameters
-        least = self.changes[0].gain - AS_GOOD if self.changed else np.inf
-        rivals = [c for c in self.causes[1:] if self.changes and (c.probability > RIVAL or c.gain > least)]
-        if rivals:
-            frames = [cause.name for cause in rivals if cause.kind == "frame"]
-            remedy = "measure more."
-            if frames:
-                remedy = f"if the reflector was exchanged or the instrument moved, use --reset '{frames[0]}_*'."
-            names = joined([cause.name for cause in rivals])
-            lines.append(f"These readings do not distinguish this from a change of {names}: {remedy}")
+        lines += filter(None, [self._alternatives()])
         if self.changes:
             lines.append(f"After these changes: {self.after}.")
         if self.undetermined:
@@ -297,14 +302,8 @@ def update(
         else:
             released += cause.members
         start = updated.x
-    if not after.likely:  # of another robot, or read otherwise than those of the result
-        refuse_misread(result, data)
-        missed = rms(updated.errors(data))
-        if missed > STRANGE * float(np.nanmax(result.nominal_errors())):
-            same = f"those of the same robot ({_robots(result)}) in the same units"
-            known = "" if {*base} & {*released} else " and instrument's frame, or --reset with what moved (base_*)"
-            found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
-            raise InputError("the new measurements", found, same + known)
+    if not after.likely:
+        _refuse_another_robot(result, updated, data, bool({*base} & {*released}))
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
     updated = _with_scales_of_motion(result, updated, problem, released, prior_inflation)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
@@ -321,6 +320,17 @@ def update(
     unclear = {each.name for each in moved if isinstance(each, Moved) and abs(each.change) < 2 * each.std}
     vague += tuple(cause.name for cause in changes if unclear.issuperset(cause.members))
     return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
+
+
+def _refuse_another_robot(result: Calibration, updated: Calibration, data: Dataset, base_reset: bool) -> None:
+    """Refuse readings that no change explains: of another robot, or read otherwise than those of the result."""
+    refuse_misread(result, data)
+    missed = rms(updated.errors(data))
+    if missed > STRANGE * float(np.nanmax(result.nominal_errors())):
+        same = f"those of the same robot ({_robots(result)}) in the same units"
+        known = "" if base_reset else " and instrument's frame, or --reset with what moved (base_*)"
+        found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
+        raise InputError("the new measurements", found, same + known)
 
 
 def _errors(
