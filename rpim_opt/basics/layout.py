@@ -194,7 +194,7 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     stated = [(row, _stated_units(row)) for row in grid.rows[: above[0] if above else 0]]
     units = next((units for _, units in reversed(stated) if units), {})
     lines_of_units = [f"units above the header: {' '.join(filter(None, row))}." for row, of_row in stated if of_row]
-    table = _columns([grid.rows[i] for i in full], heads, replace(options, units={**units, **options.units}))
+    table = _columns(grid, full, heads, replace(options, units={**units, **options.units}))
     left = set(range(numeric[0], len(grid.rows))).difference(full)
     lines_of_units += [f"--columns has {len(others)} names: the {len(heads)} of the header count."] * bool(others)
     notes = (*grid.notes, *_notes(grid, above, left, options), *lines_of_units, *table.notes)
@@ -264,13 +264,13 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
     """Return every column's name with its unit, and what groups it; and the numbers of the header's rows."""
     width = Counter(len(grid.rows[i]) for i in full).most_common(1)[0][0]
     above = _header_rows(grid, full[0], width)
-    if options.columns and (not above or len(options.columns) == width):
+    if options.columns and (not above or len(options.columns) in (width, len(grid.rows[above[-1]]))):
         return [(name, "") for name in options.columns], above
     if not above:
         found = f"no header above '{', '.join(grid.rows[full[0]][:4])}, ...'"
         accepted = f"a header, or --columns with {width} names, such as label,q1_deg,...,x_mm,y_mm,z_mm"
         raise InputError(f"line {grid.lines[full[0]]}", found, accepted)
-    lines = [_uncommented(grid.rows[i], width, grid.rows[full[0]][0]) for i in above]
+    lines = [_uncommented(grid, i, width, grid.rows[full[0]][0]) for i in above]
     width = max(map(len, lines))
     units: list[str] = []
     signs = {cell.strip("[]()").lower() for cell in lines[-1]} - {""}
@@ -278,7 +278,7 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
         units = [cell.strip("[]()") for cell in lines.pop()]
         units = ["" if unit in ("-", "1") else unit for unit in units]
     lacking = [""] * (width - len(units))
-    units = lacking + units if grid.blanks else units + lacking  # a blank cell of the label cannot be seen
+    units = lacking + units if grid.mark == " " else units + lacking  # a blank cell of the label cannot be seen
     *grouping, names = [[*line, *[""] * (width - len(line))] for line in lines]
     downwards = [  # merged downwards: the name stands higher up
         not name and any(row[i] and row[i + 1 : i + 2] != [""] for row in grouping) for i, name in enumerate(names)
@@ -302,7 +302,7 @@ def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
     """Return the rows of text directly above the data that are as wide as these, without a blank line among them."""
     headers: list[int] = []
     for i in reversed(range(max(first - LINES_OF_HEADER, 0), first)):
-        row = _uncommented(grid.rows[i], width, grid.rows[first][0])
+        row = _uncommented(grid, i, width, grid.rows[first][0])
         filled = [place for place, cell in enumerate(row, start=1) if cell]
         if (headers and grid.lines[i + 1] - grid.lines[i] > 1) or _stated_units(row):
             break
@@ -311,18 +311,21 @@ def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
         wide = len(filled) >= width / 2 or (filled[-1] > width / 2 and filled[-1] > 1)
         # merged, above names: Pose, Joint values [deg]
         wide = wide or (headers and len(filled) > 1 and any(split(cell)[1] for cell in row))
-        if not wide or len(row) > width + 1:
+        if not wide or (grid.mark and len(row) > width + 1):
             break
         headers.insert(0, i)
     return headers
 
 
-def _uncommented(row: Sequence[str], width: int, label: str) -> list[str]:
+def _uncommented(grid: Grid, line: int, width: int, label: str) -> list[str]:
     """Return a row without the sign that makes it a comment, and as wide as the table if names hold blanks.
 
-    Several names, ``Collection Group Point``, may stand above a ``label``, ``A::Robot::P1``.
+    Several names, ``Collection Group Point``, may then stand above a ``label``, ``A::Robot::P1``. Any other separator
+    says which cells stand above each other.
     """
-    cells = list(row)
+    cells = list(grid.rows[line])
+    if grid.mark != " ":
+        return [COMMENT.sub("", cells[0]), *cells[1:]]
     if len(cells) > width:
         named = BLANK_NAME.findall(" ".join(cells))
         cells = named if len(named) == width else cells
@@ -337,15 +340,16 @@ def _uncommented(row: Sequence[str], width: int, label: str) -> list[str]:
 # --- columns and their numbers -------------------------------------------------------------------------------------
 
 
-def _columns(rows: Sequence[list[str]], heads: Sequence[tuple[str, str]], options: TableOptions) -> RawTable:
+def _columns(grid: Grid, data: Sequence[int], heads: Sequence[tuple[str, str]], options: TableOptions) -> RawTable:
     """Return the columns, those of numbers with decimal points; blank cells behind rows may be missing or too many."""
+    rows = [grid.rows[i] for i in data]
     width = len(heads)
     what = "--columns, the names of files without a header" if options.columns else "the header"
     for number, row in enumerate(rows, start=1):
         while len(row) > width and not row[-1]:
             row.pop()
         lacks_remark = len(row) == width - 1 and width > 2 and not options.separator
-        if len(row) != width and not lacks_remark:
+        if len(row) != width and not lacks_remark and (grid.mark or len(row) > width):
             hint = "" if len(row) < width else "; decimal commas between commas need quotes"
             raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
         row += [""] * (width - len(row))

@@ -73,12 +73,15 @@ Columns = Mapping[str, Sequence[Any]]
 
 
 class Grid(NamedTuple):
-    """The non-blank rows of a file, their line numbers, notes on reading, and whether blanks separate cells."""
+    """The non-blank rows of a file, their line numbers, notes on reading, and what separates cells.
+
+    Nothing does in a workbook, where a row ends at its last cell that is filled.
+    """
 
     rows: list[list[str]]
     lines: list[int]
     notes: tuple[str, ...] = ()
-    blanks: bool = False
+    mark: str = ""
 
 
 # --- tables of problem folders: a header, then rows ----------------------------------------------------------------
@@ -227,7 +230,7 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
         spelled = next((word for word, sign in SEPARATORS.items() if sign == mark), repr(mark))
         why = "as requested" if separator else "this separates most numbers"
         notes = (*notes, f"cells are separated by {spelled}: {why}.")
-    return Grid(*_split(text, mark), notes, mark == " ")
+    return Grid(*_split(text, mark), notes, mark)
 
 
 def _cells_of_page(row: str) -> Iterator[str]:

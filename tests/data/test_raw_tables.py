@@ -361,6 +361,24 @@ def test_a_merged_cell_with_the_unit_of_all_joints_stands_above_them(tmp_path: P
     assert read(tmp_path / "joints.xlsx").columns["q2_deg"] == ["20.5", "21.5"]
 
 
+@pytest.mark.parametrize("remarks", [{}, {1: "again"}, {0: "new", 1: "again"}])
+@pytest.mark.parametrize(("empty", "head", "label"), [(1, "Nr", ""), (0, "#", ""), (0, "Point", "Cell::P")])
+def test_no_value_of_a_sheet_is_under_another_header_where_columns_are_empty(
+    tmp_path: Path, empty: int, head: str, label: str, remarks: dict[int, str]
+) -> None:
+    book = openpyxl.Workbook()
+    names = [*HEAD.strip().replace("Point", head).split(","), "Remark", "Operator"]
+    book.active.append([*[None] * empty, *names[: -1 if label else None]])
+    for i in range(2):
+        cells = [f"{label}{i + 1}", 10.5 + i, 20.5, 401.5, 5.5, 6.5, remarks.get(i)]
+        book.active.append([*[None] * empty, *cells])
+    book.save(tmp_path / "raw.xlsx")
+    columns = read(tmp_path / "raw.xlsx").columns
+    assert {name: cells[1] for name, cells in columns.items() if name != "label"} == {
+        "q1_deg": "11.5", "q2_deg": "20.5", "x_mm": "401.5", "y_mm": "5.5", "z_mm": "6.5",
+    }  # fmt: skip
+
+
 def test_messages_that_ros_prints_into_a_text_are_read_and_xml_is_named(tmp_path: Path) -> None:
     message = "header:\n  seq: {0}\nname: [two, one]\nposition: [{0}.5, 0.25]\nvelocity: []\neffort: []\n---\n"
     found = read(write(tmp_path, message.format(0) + message.format(1), "states.txt"), joints=("one", "two"))
