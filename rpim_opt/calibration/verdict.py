@@ -459,15 +459,12 @@ def _computed(result: Outcome) -> Iterator[str]:
     beside = ""
     if nominal < COMPUTED_RMS and noise_ratio(problem, errors) < COMPUTED:
         beside = "far below the measurement noise: the data seem to be computed from this robot, not measured."
-    elif min(rounding) > 0 and nominal < ROUNDED * np.hypot(max(rounding), _rounding_of_joints(problem.sample())):
+    elif min(rounding) > 0 and nominal < ROUNDED * np.hypot(
+        max(rounding), sum(each.made for each in diagnosis.every_rounding(problem.sample()) if each.step)
+    ):
         beside = "no more than rounding makes: the data seem to be computed from this robot, or have too few decimals."
     if beside:
         yield f"The error of the nominal robot is {1e3 * nominal:.2g} mm RMS, {beside}"
-
-
-def _rounding_of_joints(problem: CalibrationProblem) -> float:
-    """Return the RMS error [m] that rounding of all joint values makes; 0 if they are not rounded."""
-    return max((each.made for each in diagnosis.every_rounding(problem) if each.step), default=0.0)
 
 
 # --- likely causes ------------------------------------------------------------------------------------------------

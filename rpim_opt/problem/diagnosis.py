@@ -314,13 +314,13 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
     """Report rounding of joint or measured values that explains the RMS error [m] of a fit, or what it excludes."""
     alike = list(roundings(problem, error, ALIKE[1]))
     yield from alike
-    steps = [each for each in every_rounding(problem) if each.step and each.made > ALIKE[1] * error and not alike]
-    for each in steps[-1:]:
-        yield (
-            f"joint values are multiples of {each.step}, but errors of {three_digits(1e3 * error)} mm are smaller than "
-            f"rounding would cause ({three_digits(1e3 * each.made)} mm): these are commanded joint values. Log the "
-            "measured ones."
-        )
+    for each in every_rounding(problem):
+        if each.step and each.made > ALIKE[1] * error and not alike:
+            yield (
+                f"joint values are multiples of {each.step}, but errors of {three_digits(1e3 * error)} mm are smaller "
+                f"than rounding would cause ({three_digits(1e3 * each.made)} mm): these are commanded joint values. "
+                "Log the measured ones."
+            )
 
 
 def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterator[str]:
@@ -335,15 +335,15 @@ def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterato
 
 def every_rounding(problem: CalibrationProblem) -> Iterator[Rounding]:
     """Yield roundings of joint and measured values that are there, whatever they explain."""
-    turning = np.array(problem.robot.joint_dimensions) == "angle"
-    angles = all_q(problem.data)[:, turning]
-    slopes = problem.joint_slopes()[Equations.of(problem.data).length]
-    arm = float(np.sqrt(np.sum(slopes**2) / len(problem.data)))  # how far all joints move a point, a radian each
+    q, turning = all_q(problem.data), np.array(problem.robot.joint_dimensions) == "angle"
+    slopes = problem.joint_slopes(sliding=True)[Equations.of(problem.data).length] @ problem.robot.joint_map
+    levers = np.sqrt(np.sum(slopes**2, axis=0) / len(problem.data))  # how far a joint moves a point [m/rad, m/m]
+    angles = q[:, turning]
     decimals = (np.abs(np.degrees(angles)) % 1).round(6)
     if (decimals < 0.6).all():
         minutes = "joint values look like degrees and minutes (no decimals from .60 on)"
         least = TAKEN_UP if len(np.unique(decimals)) > MANY_MINUTES else ALIKE[0]
-        yield Rounding(minutes, np.radians(0.4) / np.sqrt(3) * arm, "convert them", least)
+        yield Rounding(minutes, np.radians(0.4) / np.sqrt(3) * np.linalg.norm(levers[turning]), "convert them", least)
     for block in problem.data.blocks:
         columns = {name: i for i, (name, of) in enumerate(block.measurement.columns.items()) if of == "length"}
         if len(block.y) < FEWEST or not columns:  # lengths of a drawing are round
@@ -357,16 +357,19 @@ def every_rounding(problem: CalibrationProblem) -> Iterator[Rounding]:
         of = "" if len(coarse) == len(columns) else f" ({', '.join(coarse)})"
         what = f"measured values are rounded to {units.max(initial=0.0):.4g} mm{of}"
         yield Rounding(what, 1e-3 * made, "export more decimals, or state the rounding as their noise")
-    levers = np.sqrt(np.sum((slopes @ problem.robot.joint_map) ** 2, axis=0) / len(problem.data))[turning]
+    every = []
     for name, size in (("deg", np.pi / 180), ("rad", 1.0)):
-        steps = np.array([_unit(column, _step(column)) for column in angles.T / size])
-        each = size * np.sqrt(np.mean(steps**2, axis=1) / 12) * levers
+        si, units = np.where(turning, size, 1e-3), np.where(turning, name, "mm")
+        steps = np.array([_unit(column, _step(column)) for column in (q / si).T])
+        each = si * np.sqrt(np.mean(steps**2, axis=1) / 12) * levers
         made = float(np.linalg.norm(each))
-        of = ", ".join(f"q{i + 1}" for i, part in zip(np.flatnonzero(turning), each, strict=True) if 10 * part > made)
-        step = f"{steps.max(initial=0.0):g} {name}"
-        up_to = "up to " * bool(np.ptp(steps, axis=1).any())
+        coarse = 10 * each > made
+        step = " and ".join(f"{steps[coarse & (units == u)].max():g} {u}" for u in dict.fromkeys(units[coarse]))
+        up_to = "up to " * bool(np.ptp(steps[coarse], axis=1).any())
+        of = ", ".join(f"q{i + 1}" for i in np.flatnonzero(coarse))
         what = f"joint values are rounded to {up_to}{step} ({of})"
-        yield Rounding(what, made, "export them with more decimals", step=step if steps.all() else "")
+        every.append(Rounding(what, made, "export them with more decimals", step=step if steps.all() else ""))
+    yield max(every, key=lambda each: each.made)
 
 
 def _unit(values: Array, *steps: float) -> Array:
@@ -834,10 +837,11 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
         yield from first(two_positions(problem, x, min(limit, MOVED * left)), _said_of_addition(best))
     else:
         said = [_said_of_kinds(problem, rows, part)] if kinds else ()
+        rounding = roundings(problem, rms(problem.errors(x)), (1 - MOVED) ** -0.5)
         noise = _uneven_noise(problem, x) if acceptable == 1 else ()  # else errors are too large for noise
         backlash = two_positions(problem, x, min(limit, part / MOVED) if kinds else limit)
         states = () if problem.touches else two_states(problem, x)
-        yield from first(backlash, states, said, noise, scattered_rows(problem, x))
+        yield from first(backlash, states, said, rounding, noise, scattered_rows(problem, x))
 
 
 def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[str]:

@@ -561,17 +561,17 @@ class CalibrationProblem(RobotModel):
             np.add.at(slopes.T, [columns[name] for name in p.names if name in columns], J.T)
         return slopes
 
-    def joint_slopes(self, at: Array | None = None) -> Array:
-        """Return the slopes (m, dof) of the modelled values by the joints' angles [SI]; zero for sliding joints.
+    def joint_slopes(self, at: Array | None = None, sliding: bool = False) -> Array:
+        """Return the slopes (m, dof) of the modelled values by joint angles [SI]; by strokes zero, unless ``sliding``.
 
         They are taken at values ``at`` (P,) of all parameters [SI]; None for nominal.
         """
         joints = {}
         for name, robot in self.arms.items():
             for i, kind in enumerate(robot.joint_types):
-                if kind == "revolute":
-                    joints[f"theta{i + 1}"] = i
-                    joints[f"{name}.theta{i + 1}"] = i
+                if kind == "revolute" or sliding:
+                    zero = f"{'theta' if kind == 'revolute' else 'd'}{i + 1}"
+                    joints |= {zero: i, f"{name}.{zero}": i}
         # the same joint of several robots: a row has slopes by those of its own robot alone
         return self._slopes_by(joints, max(len(robot.mdh) for robot in self.arms.values()), at)
 

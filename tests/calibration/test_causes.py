@@ -1020,6 +1020,16 @@ def test_a_stroke_in_inches_is_named() -> None:
     assert "values of linear joints in inches" in better_interpretation(joints(lambda q: q * inches)(problem)).sentence
 
 
+@pytest.mark.parametrize("step", [1.0, 0.5])
+def test_a_stroke_that_is_rounded_is_named(step: float) -> None:
+    """It alone explains the error of z, whatever measured that."""
+    problem = ro.load("scara").problem
+    sliding = np.array(problem.robot.joint_dimensions) == "length"
+    coarse = joints(lambda q: np.where(sliding, 1e-3 * step * (1e3 * q / step).round(), q))(problem)
+    reasons = ro.calibrate(coarse).verdict.reasons
+    assert any(f"joint values are rounded to {step:g} mm (q3)" in text for text in reasons), reasons
+
+
 def test_a_quill_that_is_not_declared_prismatic_is_named() -> None:
     """Its millimetres are read as degrees."""
     problem = ro.load("scara").problem
