@@ -760,6 +760,13 @@ def test_limits_of_a_sheet_stand_in_two_columns(tmp_path: Path, columns: str, ce
     assert np.degrees(ro.read_robot(tmp_path / "r.csv").limits) == pytest.approx(np.array([[-170, 165]]))
 
 
+def test_limits_without_a_unit_have_that_of_their_joint(tmp_path: Path) -> None:
+    header = "type,alpha [deg],a [mm],theta [deg],d [mm],min,max,convention"
+    cells = "revolute,0,100,0,300,-170,165,modified\nprismatic,0,0,0,0,0,200,modified\n"
+    (tmp_path / "r.csv").write_text(f"{header}\n{cells}")
+    assert ro.read_robot(tmp_path / "r.csv").limits == pytest.approx(np.array([np.radians([-170, 165]), [0, 0.2]]))
+
+
 def test_a_table_is_written_as_a_person_would(tmp_path: Path) -> None:
     ro.robot.write_robot(UR10, tmp_path / "ur10.csv")
     lines = (tmp_path / "ur10.csv").read_text().splitlines()

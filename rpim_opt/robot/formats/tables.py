@@ -176,8 +176,9 @@ def read_robot(path: str | Path) -> Robot:
 
     TOML and JSON have the keys of ``robot.toml`` (the guide "Your own robot"). CSV has one row per joint and the keys
     of a ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``,
-    ``lower_deg,upper_deg`` (``_mm`` for prismatic joints), ``mass_kg,centre_x_mm,centre_y_mm,centre_z_mm``; a column
-    ``convention`` states ``modified`` or ``standard``. InputError names file, key or column.
+    ``lower,upper`` (in the unit of theta, of d for prismatic joints, or of their own), ``mass_kg``,
+    ``centre_x_mm,centre_y_mm,centre_z_mm``; a column ``convention`` states ``modified`` or ``standard``. InputError
+    names file, key or column.
 
     >>> import rpim_opt as ro
     >>> ro.robot.write_robot(ro.load("paper_arm").problem.robot, "robot.toml")
@@ -286,10 +287,12 @@ def _joint(cells: dict[str, str]) -> dict[str, Any]:
             for kind in (float, int):
                 with suppress(ValueError):
                     joint[name] = kind(text)
-    for unit in UNITS:
-        pair = [joint.pop(f"{which}_{unit}", None) for which in LIMITS]
+    variable = "d" if joint.get("type") == "prismatic" else "theta"
+    own = next((unit for unit in UNITS if f"{variable}_{unit}" in cells), "")
+    for unit in ("", *UNITS):  # limits without one have that of the joint's variable
+        pair = [joint.pop(f"{which}_{unit}".rstrip("_"), None) for which in LIMITS]
         if any(value is not None for value in pair):
-            joint[f"limits_{unit}"] = pair
+            joint[f"limits_{unit or own}"] = pair
     return joint
 
 
