@@ -572,9 +572,8 @@ def tail_widening(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, 
     The normal of variance v_j that stands for the t_nu of a deviation j has its curvature at the mean, not its width.
     What the data say of z_j, apart from that normal, has the precision p = 1 / C_jj - 1 / v_j and the mean
     z_j / (C_jj p). V_j is the variance of that times t_nu, and w_j = 1 / V_j - p the precision that a normal in the
-    place of the tails needs to agree (one step of expectation propagation; means stay)::
-
-        C + D D' = (C^-1 - diag(1 / v - w))^-1        D = C B L^-T,    B B' = diag(1 / v - w),    L L' = I - B'C B
+    place of the tails needs to agree (one step of expectation propagation; means stay): D is that `without_information`
+    1 / v - w.
     """
     c = C.diagonal()[heavy]
     local = v[heavy]
@@ -590,10 +589,22 @@ def tail_widening(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, 
     middle = np.sum(share * mean, axis=1, keepdims=True)
     variance = np.sum(share * (1 / both + (mean - middle) ** 2), axis=1)
     precision = 1 / variance / size**2 - known
-    B = np.sqrt(1 / local - np.clip(precision, 1 / (MOST_WIDENED * local), 1 / local))
-    own = C[np.ix_(heavy, heavy)]
-    L = np.linalg.cholesky(np.eye(len(B)) - own * np.outer(B, B))
-    return np.asarray(np.linalg.solve(L, (C[:, heavy] * B).T).T, dtype=float)
+    taken = np.zeros(len(z))
+    taken[heavy] = 1 / local - np.clip(precision, 1 / (MOST_WIDENED * local), 1 / local)
+    return without_information(C, taken)
+
+
+def without_information(C: Array, taken: Array) -> Array:
+    """Return D (p, k), C + D D' = (C^-1 - diag(taken))^-1: the covariance without information (p,) that it contains.
+
+    ::
+
+        D = C B L^-T,    B B' = diag(taken),    L L' = I - B'C B
+    """
+    some = np.flatnonzero(taken)
+    B = np.sqrt(taken[some])
+    L = np.linalg.cholesky(np.eye(len(B)) - C[np.ix_(some, some)] * np.outer(B, B))
+    return np.asarray(np.linalg.solve(L, (C[:, some] * B).T).T, dtype=float)
 
 
 def widening(C: Array, factor: float) -> Array:

@@ -11,8 +11,18 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Brief, joined
-from rpim_opt.bayes.evidence import FARTHEST, Evidence, Hierarchy, Linearized, Point, Spectrum, tail_widening, widening
-from rpim_opt.bayes.prior import SESSIONS, Prior
+from rpim_opt.bayes.evidence import (
+    FARTHEST,
+    Evidence,
+    Hierarchy,
+    Linearized,
+    Point,
+    Spectrum,
+    tail_widening,
+    widening,
+    without_information,
+)
+from rpim_opt.bayes.prior import BASE, SESSIONS, Prior
 from rpim_opt.bayes.prior_terms import ScaledPrior
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.data.dataset import Dataset
@@ -333,7 +343,14 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     if m < n:
         rest = f"at least {n - m} parameter combinations are unidentifiable."
         notes.append(f"{m} equations for {n} parameters: {rest}")
-    drift = [point.slopes @ root, tail_widening(point.z, point.C, point.v, heavy, scales, prior.tails)]
+    # the base was registered with the nominal robot: that it is near to there, by which its scale is estimated, does
+    # not say what of joint 1 the registration has taken up; only the stated scale does
+    of_base = np.array([*prior.names, ""])[prior.group] == BASE
+    taken = np.where(of_base & ~prior.replaced, np.maximum(1 / point.v - 1, 0.0), 0.0)
+    widened = without_information(point.C, taken)
+    C = point.C + widened @ widened.T
+    drift = [point.slopes @ root, widened]
+    drift.append(tail_widening(point.z + C @ (taken * point.z), C, point.v, heavy, scales, prior.tails))
     if prior.spectrum is None:  # curves have a prior of their own; a prediction may leave the range of any joint
         factors = evidence.overdispersion(point, fit.problem.joint_values[fit.problem.owners])
         drift.append(widening(point.C, factors.max()))

@@ -153,8 +153,7 @@ def require_same_arm(robot: Robot, original: Robot, file: Path) -> list[str]:
     if abs(deviation[joint, column]) > ANOTHER_ARM:
         unit = "rad" if column % 2 == 0 else "m"
         found = f"{MDH[column]}{joint + 1} differs from the file by {abs(deviation[joint, column]):.3g} {unit}"
-        accepted = "a robot calibrated with this file's nominal parameters, between the same links: begin with "
-        accepted += f"rpim-opt new --robot {file.name}"
+        accepted = "the file that the calibration began with, between the same links"
         raise InputError(f"robot ({robot.source or robot.name})", found, accepted, file)
     if zeros:
         notes.append(

@@ -49,6 +49,7 @@ SHARED = (
     'Chains share their common joints. State other shared parameters as `shared` in problem.toml: ["base_*"] where '
     'one instrument measured several chains from one link; by chain as { left = ["base_*"], ... }.'
 )
+EXPORTED = re.compile(rb"calibrated (\d{4}-\d\d-\d\d, digest \w+)")  # in the notes of an exported file
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
 FARTHEST = 50.0  # distance from the instrument to a base beyond which the units are likely wrong [m]
@@ -184,6 +185,13 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Interpretation, rows:
             "noise beyond it is taken for the robot's repeatability."
         )
     yield from (f"{source.name}, {note}" for note in arm.notes)
+    exported = EXPORTED.search(files.read_bytes(source))
+    if exported:
+        yield (
+            f"{source.name} was exported from a calibration ({exported[1].decode()}). It does not state what that one "
+            "left undetermined, and its uncertainty would be too small: recalibrate with that result as prior "
+            "(rpim-opt update RESULTS TABLE), or begin with the robot's original file."
+        )
     there = "the flange's origin"
     if placed(arm.tool) != placed(np.zeros(6)):  # of a URDF, or a DH table in another convention than the modified one
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"

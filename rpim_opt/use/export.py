@@ -43,6 +43,9 @@ from rpim_opt.use.compensation import tool_uncertainty, turns_measured
 from rpim_opt.use.sessions import base_frame, in_session, session_notes
 
 OF_BYTES = "surrogateescape"  # files of other tools keep their encoding
+WRITER = "rpim_opt: "
+EARLIER = re.compile(rf"^(?:# {WRITER}[^\n]*|<!-- {WRITER}.*?-->)\r?\n", re.MULTILINE)
+"""Comments of what was exported to a file before."""
 ANOTHER_MODEL = 0.01  # lengths of a robot that are off its model's by more [m] are another model's, d1 another base's
 FLANGE = "the flange frame (after the last joint; alpha and a in the last row of a DH sheet follow it)"
 CONVENTION = {  # what is said of a table in a convention
@@ -341,7 +344,10 @@ def _write_urdf(
     notes = []
     frame = "the instrument's frame" + (result.problem.session and f" of session '{result.problem.session}'")
     if base is not None:
-        notes.append(f"URDF: {root} is at the identified base, {placed(base)} in {frame}.")
+        notes.append(
+            f"URDF: {root} is {frame}: the identified base, {placed(base)} in it, is in the first joint's origin, so "
+            f"that {root} needs no other pose."
+        )
     elif of_base or of_session:
         at = placed(frame_numbers(numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))))
         notes.append(
@@ -509,10 +515,13 @@ def _yaml_list(text: str, key: str, shape: tuple[int, ...], path: Path) -> tuple
 
 
 def noted(content: bytes, ending: str, notes: Sequence[str]) -> bytes:
-    """Return the content of a file with notes: comments, a column of CSV, or the key ``source`` of JSON."""
-    text = content.decode("utf-8-sig", OF_BYTES)
+    """Return the content of a file with notes: comments, a column of CSV, or the key ``source`` of JSON.
+
+    Comments of an earlier calibration, which was exported to the file before, go: its frames are others.
+    """
+    text = EARLIER.sub("", content.decode("utf-8-sig", OF_BYTES))
     notes = ["".join(character if character.isprintable() else " " for character in each) for each in notes]
-    note = " ".join(notes)
+    note, end = " ".join(notes), "\r\n" if "\r\n" in text else "\n"
     if ending == ".json":
         whole = json.loads(text)
         text = json_text({**whole, "source": f"{note} {whole.get('source', '')}".strip()})
@@ -522,9 +531,10 @@ def noted(content: bytes, ending: str, notes: Sequence[str]) -> bytes:
         text = csv_text([*header, "note"], [[*row, cell] for row, cell in zip(rows, cells, strict=False)])
     elif ending in (".urdf", ".xml"):
         note = re.sub("-+", "-", re.sub(r"--+(?=\w)", "option ", note))  # a comment may not contain two hyphens
-        text = re.sub(r"(?s)(<\?xml.*?\?>\s*)?", lambda declared: f"{declared[0]}<!-- {note} -->\n", text, count=1)
+        comment = f"<!-- {WRITER}{note} -->{end}"
+        text = re.sub(r"(?s)(<\?xml.*?\?>\s*)?", lambda declared: f"{declared[0]}{comment}", text, count=1)
     else:
-        text = "".join(f"# {each}\n" for each in notes) + text
+        text = "".join(f"# {WRITER}{each}{end}" for each in notes) + text
     return text.encode(errors=OF_BYTES)
 
 

@@ -88,6 +88,9 @@ def _targets(robot: Robot, understanding: Interpretation) -> Targets:
     positions = oriented or not stems.isdisjoint("xyz")  # without x, y, z an orientation is refused as half a pose
     if any(each.doubt == "quaternion" for each in understanding.tables):
         raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
+    if "rx_rad" in columns and not joints and any(each.doubt == "rotation" for each in understanding.tables):
+        accepted = "--rotation vector (Universal Robots), or --rotation 'extrinsic xyz' (roll, pitch, yaw)"
+        raise InputError("the header", "rx, ry, rz in rad, which joint values would tell apart", accepted)
     if not joints and not positions:
         raise InputError("the header", "no targets", "columns q1_deg, ..., or x_mm, y_mm, z_mm, or both")
     absent = [] if joints else list(joint_columns(robot.joint_dimensions))

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cvxpy as cp
 import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.basics.arrays import rms
 from rpim_opt.calibration.covariance import row_dof
-from tests.simulate import simulated
+from rpim_opt.robot import forward_kinematics
+from rpim_opt.robot.kinematics import numeric_frame
+from tests.simulate import ARM, simulated
 
 Q = np.random.default_rng(77).uniform(-2, 2, (50, 6))
 
@@ -27,6 +32,23 @@ def covered(seeds: range) -> np.ndarray:
 @pytest.mark.slow
 def test_intervals_of_predicted_positions_cover_in_a_thousand_calibrations() -> None:
     assert 0.93 < covered(range(1000)).mean() < 0.97
+
+
+def test_zeros_of_joint_1_are_as_uncertain_as_its_prior_where_the_base_was_registered() -> None:
+    """Registration takes up the zero of joint 1: that the base is near to where it was registered tells nothing."""
+    off, stated = [], []
+    for seed in range(20):
+        rng = np.random.default_rng([seed, 12])
+        off_nominal = rng.normal(size=(6, 5)) * [1e-3, 6e-4, np.radians(0.5), 6e-4, 0]
+        q = rng.uniform(-2, 2, (30, 6))
+        arm = replace(ARM, mdh=ARM.mdh + off_nominal)
+        T = numeric_frame([1.1, -0.4, 0.2, 0.01, -0.02, 0.8]) @ forward_kinematics(arm, q)
+        y = (T @ [0.03, -0.02, 0.06, 1.0])[:, :3] + 5e-5 * rng.normal(size=(30, 3))
+        result = ro.calibrate(ro.problem_from(ARM, ro.Dataset.of(q, y, 5e-5)))
+        i = result.problem.parameters.free.names.index("theta1")
+        off.append(result.x[i] - off_nominal[0, 2])
+        stated.append(np.sqrt(result.covariance[i, i]))
+    assert 0.6 < rms(np.divide(off, stated)) < 2.0  # 2.7 where the scale of the base counts
 
 
 def test_the_noise_is_compared_with_the_declared() -> None:

@@ -577,6 +577,12 @@ def test_turns_in_another_convention_than_that_of_the_joint_values_beside_them_a
     assert len(ro.use.read_targets(result, table)[0].label) == 6
     write(table, head, np.hstack([q, 1e3 * poses[:, :3], accepted["vector"]]))
     assert len(ro.use.read_targets(result, table, tool=[0, 0, 0, 0.5, 0.2, 0])[0].label) == 6
+    # without joint values nothing tells
+    write(table, ["label", *head[7:]], np.hstack([1e3 * poses[:, :3], accepted["vector"]]))
+    with pytest.raises(ro.InputError, match=r"rx, ry, rz in rad, .*rotation vector"):
+        ro.use.read_targets(result, table)
+    told = ro.use.read_targets(result, table, ro.data.TableOptions(rotation="vector"))[0]
+    assert misses(told.poses, poses)[1].max() < 1e-7
 
 
 def write(path: Path, head: list[str], values: np.ndarray) -> None:

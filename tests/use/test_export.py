@@ -48,6 +48,10 @@ def test_files_of_universal_robots_state_the_tcp_and_the_base_that_belong_to_the
     result = replace(ro.calibrate(problem, "tikhonov", 1.0), x=truth)
     options = {"ur_calibration" if file.endswith("conf") else "ur_kinematics": path}
     ro.use.export_files(result, target, **options, despite_verdict=True)
+    # once more, into what was exported: the shoulder has all six numbers now, and the file notes of its own
+    path.write_bytes(target.read_bytes())
+    ro.use.export_files(result, target, **options, despite_verdict=True)
+    assert target.read_text().count("TCP to enter") == 1
     q = configurations(6)
     if file.endswith("conf"):
         flange = reach(ro.robot.read_ur_calibration(target, UR10), q)

@@ -186,7 +186,7 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
     notes = require_same_arm(robot, read_ur_kinematics(path).robot, path)
     if robot.mdh[-1, 4]:
         raise InputError("robot", "beta6, which follows the last joint", "a robot with beta6 = 0")
-    origins, _, size = corrected(chain, robot.mdh)
+    origins, _, size = corrected(chain, robot.mdh, base=np.zeros(6))  # the base is said, also where the file had one
     edits = {}
     for name, T, old in zip(JOINTS, origins, chain.origins, strict=True):
         texts = origin_numbers(T, old, size)
