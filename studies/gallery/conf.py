@@ -69,10 +69,21 @@ def escaped(app: object, what: str, name: str, of: object, options: object, line
             lines[i] = "".join(parts)
 
 
+def readable(
+    app: object, what: str, name: str, of: object, options: object, signature: str | None, result: str | None
+) -> tuple[str | None, str | None]:
+    """Write arrays by their name, and defaults that are made anew as dots: with these Sphinx parses no signature."""
+    if signature is not None:
+        signature = re.sub(r"~?numpy\.ndarray\[tuple\[.*?\], ~?numpy\.dtype\[~?numpy\.float64\]\]", "Array", signature)
+        signature = signature.replace("<factory>", "...")
+    return signature, result
+
+
 def setup(app: Any) -> None:
     """Register what the pages need beside Sphinx's own, and write the reference."""
     import reference  # found through the path above
 
     app.add_html_math_renderer("mathml", inline_renderers=(inline, None), block_renderers=(displayed, None))
     app.connect("autodoc-process-docstring", escaped)
+    app.connect("autodoc-process-signature", readable)
     reference.write(HERE / "reference")
