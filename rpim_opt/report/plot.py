@@ -193,7 +193,7 @@ def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | N
     colours = LinearSegmentedColormap.from_list("U", [FAINT, COLORS["after"]]).with_extremes(over=COLORS["mark"])
     drawn = ax.pcolormesh(x, y, grid.T, cmap=colours, vmin=min(float(bound.min()), 0.9 * top), vmax=top)
     said = {"label": "U [mm], above the limit in red", "extend": "max"} if high > top else {"label": "U [mm]"}
-    ax.figure.colorbar(drawn, ax=ax, **said)
+    ax.figure.colorbar(drawn, ax=ax, location="bottom", **said)
     if box is not None:
         (a, b), (c, d) = box[across], box[up]
         ax.plot([a, b, b, a, a], [c, c, d, d, c], color=COLORS["ink"])
