@@ -779,7 +779,7 @@ BAD = {
     "all held out": ([*NEW, "--hold-out", "1"], ["--hold-out", "between 0 and 1"]),
     "bad validation": ([*NEW, "--validation", "broken.csv"], ["broken.csv", "row 2", "'inf'"]),
     "another robot's data": ([*NEW[:3], "panda", *NEW[4:]], ["measured.csv", "no column for 'q7'"]),
-    "several points": ([*NEW[:5], "points.csv", *NEW[6:]], ["column 'x2', another point or reading", "marker"]),
+    "several points": ([*NEW[:5], "points.csv", *NEW[6:]], ["another point or reading", "below each other", "marker"]),
     "a turning joint in mm": (
         [*NEW[:5], "sliding.csv", *NEW[6:]], ["'joint_6 [mm]' (joint 6) in mm", 'another type of the joint']
     ),

@@ -502,10 +502,10 @@ def _one_row_each(table: RawTable) -> RawTable:
 
 
 def _axis(columns: Mapping[str, Sequence[Any]]) -> tuple[str, list[str]]:
-    """Return the column whose cells name x, y, z or the joints and nothing else, and these names; or none."""
+    """Return the column whose cells name x, y, z or the joints of several points alone, and these names; or none."""
     for name, cells in columns.items():
         parts = sorted({str(cell).strip().lower() for cell in cells})
-        if PARTS.fullmatch(" ".join(parts)):
+        if len(parts) < len(cells) and PARTS.fullmatch(" ".join(parts)):
             return name, parts
     return "", []
 

@@ -40,9 +40,11 @@ EXCEL_ROWS = 2**20
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": " "}
 """What may stand between cells, by name; a space stands for any number of them."""
 SAMPLE = 2**15  # characters from which the separator is found
-HTML = (".html", ".htm")
-TEXTS = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", ".xyz", ".pts", ".md", *HTML)
+TEXTS = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", ".xyz", ".pts", ".md", ".html", ".htm", ".xls")
+"""Endings of tables as text; instruments and web pages call these .xls, too."""
 EXCEL = (".xlsx", ".xlsm", ".ods")
+EXCEL_97, ZIPPED = b"\xd0\xcf\x11\xe0", b"PK\x03\x04"  # how workbooks begin, old ones and those of today
+BORDERS = str.maketrans("│┃║", "|||")  # lines between the columns of printed tables
 NUMBERS_OF_ROW = 3  # numbers in a row from which on a sheet is one of measurements
 NUMERAL = re.compile(r"(?!\d+([.,])(?:\d\d?|\d{4,})\1)[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")  # no 31.05.2026
 NO_NUMBER = re.compile(
@@ -215,14 +217,18 @@ def _require_few(numbers: int) -> None:
 def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = "") -> Grid:
     """Return the rows of a text or Excel file; arguments as in `TableOptions`."""
     require_file(path, LARGEST_DATA, (*TEXTS, *EXCEL))
-    if path.suffix.lower() in EXCEL:
+    with path.open("rb") as stream:
+        begins = stream.read(len(ZIPPED))
+    if begins == EXCEL_97:
+        raise InputError("the file", "a workbook of Excel 97 to 2003", "one that was saved as .xlsx")
+    if path.suffix.lower() in EXCEL or (path.suffix.lower() == ".xls" and begins == ZIPPED):
         return _excel(path, sheet)
     if sheet:
         raise InputError("--sheet", f"'{sheet}' of a text file", "an Excel workbook")
     whole, notes = decoded(path, encoding)
-    if path.suffix.lower() in HTML:
+    if whole.lstrip().startswith("<"):
         whole = "\n".join("\t".join(_cells_of_page(row)) for row in re.split(r"(?i)<tr\b", whole)[1:])
-    text = FORTRAN.sub("e", NO_NUMBER.sub("", SEXAGESIMAL.sub(_decimal, whole)))
+    text = FORTRAN.sub("e", NO_NUMBER.sub("", SEXAGESIMAL.sub(_decimal, whole.translate(BORDERS))))
     mark = SEPARATORS.get(separator, separator.replace("\\t", "\t")) if separator else _separator(text)
     if len(mark) != 1:
         raise InputError("--separator", f"'{separator}'", choices(separator, SEPARATORS))
@@ -257,7 +263,7 @@ def decoded(path: Path, encoding: str = "") -> tuple[str, tuple[str, ...]]:
             if ZEROS in block:
                 raise binary
     data = read_bytes(path, LARGEST_DATA)
-    if data.startswith((b"\x1f\x8b", b"BZh", b"PK\x03\x04")):
+    if data.startswith((b"\x1f\x8b", b"BZh", ZIPPED)):
         raise InputError("the text", "a compressed file", "a text file: unpack it first")
     name, why = (encoding, "as requested") if encoding else _encoding(data)
     try:

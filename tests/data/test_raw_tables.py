@@ -104,6 +104,24 @@ def test_a_file_of_another_kind_is_named(tmp_path: Path) -> None:
         read(write(tmp_path, HEAD + ROWS, "raw.pdf"))
 
 
+@pytest.mark.parametrize("kind", ["page", "text", "workbook", "old workbook"])
+def test_what_is_in_a_file_called_xls_is_read(tmp_path: Path, kind: str) -> None:
+    rows = [row.split(",") for row in (HEAD + ROWS).splitlines()]
+    cells = ("".join(f"<td>{cell}</td>" for cell in row) for row in rows)
+    content = {
+        "page": ("<html><table>" + "".join(f"<tr>{row}</tr>" for row in cells) + "</table></html>").encode(),
+        "text": (HEAD + ROWS).replace(",", "\t").encode(),
+        "workbook": book(tmp_path).read_bytes(),
+        "old workbook": b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(504),
+    }
+    path = write(tmp_path, content[kind], "report.xls")
+    if kind == "old workbook":
+        with pytest.raises(ro.InputError, match=r"a workbook of Excel 97.*accepted: one that was saved as \.xlsx"):
+            read(path)
+    else:
+        assert read(path).columns["z_mm"] == ["6", "7"]
+
+
 def test_the_first_sheet_with_numbers_is_read_and_another_one_by_name_or_number(tmp_path: Path) -> None:
     path = book(tmp_path)
     found = read(path)

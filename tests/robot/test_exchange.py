@@ -779,12 +779,13 @@ def test_a_table_is_written_as_a_person_would(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "found"),
     [
-        ("r.csv", "alpha_deg,a,convention\n1,2,modified\n", "unknown key|no unit"),
+        ("r.csv", "alpha_deg,a,convention\n1,2,modified\n", "column 'a' without a unit"),
         ("r.csv", "alpha_deg,alpha_rad,convention\n1,2,modified\n", "alpha twice, in two units"),
         ("r.csv", "alpha_deg,a_mm,d_mm,convention\nninety,1,2,modified\n", "joint 1.alpha_deg: found 'ninety'"),
         ("r.csv", "alpha_deg,a_mm,d_mm,convention\nnan,1,2,modified\n", "joint 1.alpha_deg"),
         ("r.csv", "a_mm,d_mm,type,convention\n1,1,screw,modified\n", "joint 1.type: found 'screw'"),
         ("r.csv", "d_mm,Range [deg],convention\n1,±170,modified\n", r"both limits in a column, 'Range \[deg\]'"),
+        ("r.csv", "d_mm,Bereich [deg],convention\n1,±170,modified\n", r"both limits in a column, 'Bereich \[deg\]'"),
         ("r.csv", "d_mm,lower_deg,convention\n1,5,modified\n", "joint 1.limits_deg: found None"),
         ("r.csv", "", "an empty file"),
         ("r.json", "[]", "found list"),

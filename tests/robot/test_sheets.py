@@ -155,8 +155,25 @@ def test_an_index_of_the_link_before_says_that_it_is_modified(tmp_path: Path, he
             "| Joint 3 | -pi/2 | 0.035 | 0 | -pi/2 |\n| Joint 4 | 0 | 0 | 0.42 | 0.5 * pi |\n"
             "| Joint 5 | 0 | 0 | 0 | -\u03c0/2 |\n| Joint 6 | 0 | 0 | 0.08 | 0 |\n",
         ),
+        (
+            "toolbox.txt",
+            "DHRobot: KR 6 R900, 6 joints (RRRRRR), standard DH parameters\n┌──┬──┬──┬──┐\n"
+            "│ θⱼ │ dⱼ [m] │ aⱼ [m] │ \u237aⱼ │\n├──┼──┼──┼──┤\n│ q1 │ 0.4 │ 0.025 │ -90.0° │\n"
+            "│ q2 │ 0 │ 0.455 │ 0.0° │\n│ q3 - 90° │ 0 │ 0.035 │ -90.0° │\n│ q4 │ 0.42 │ 0 │ 90.0° │\n"
+            "│ q5 │ 0 │ 0 │ -90.0° │\n│ q6 │ 0.08 │ 0 │ 0.0° │\n└──┴──┴──┴──┘\n",
+        ),
+        (
+            "units.csv",
+            "Units: m\nAchse,theta-Offset,a,d,alpha [rad]\n1,0,0.025,0.4,-pi/2\n2,0,0.455,0,0\n3,-pi/2,0.035,0,-pi/2\n"
+            "4,0,0,0.42,pi/2\n5,0,0,0,-pi/2\n6,0,0,0.08,0\n",
+        ),
+        (
+            "plain.csv",
+            "i,theta_i,a_i [mm],d_i [mm],alpha_i [deg]\n1,q1,25,400,-90\n2,q2,455,0,0\n3,q3-90,35,0,-90\n"
+            "4,q4,0,420,90\n5,q5,0,0,-90\n6,q6,0,80,0\n",
+        ),
     ],
-    ids=["a joint a column", "Markdown, parts of pi"],
+    ids=["a joint a column", "Markdown, parts of pi", "a box of lines", "a unit above the header", "names of angles"],
 )
 def test_a_sheet_as_people_write_it_is_the_robot(tmp_path: Path, name: str, content: str) -> None:
     (tmp_path / name).write_text(content, encoding="utf-8")
@@ -164,6 +181,27 @@ def test_a_sheet_as_people_write_it_is_the_robot(tmp_path: Path, name: str, cont
     expected = np.array([[0, 0, 0, 0.4, 0], [-90, 0.025, 0, 0, 0], [0, 0.455, -90, 0, 0], [-90, 0.035, 0, 0.42, 0],
                          [90, 0, 0, 0, 0], [-90, 0, 0, 0.08, 0]])  # fmt: skip
     assert np.abs(arm.robot.mdh - expected * [np.pi / 180, 1, np.pi / 180, 1, 1]).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("header", "turn", "said"),
+    [
+        ("theta,alpha [rad]", "-1.57079633", ""),
+        ("theta,alpha [rad]", "q2 - 90", r"'theta' without a unit, accepted: theta \[deg\] or theta \[rad\]"),
+        ("theta,alpha [deg]", "1.5708", "pi/2 rad"),
+        ("theta,alpha", "0", "'theta' without a unit"),
+    ],
+)
+def test_an_angle_without_a_unit_is_in_that_of_the_others(tmp_path: Path, header: str, turn: str, said: str) -> None:
+    path = tmp_path / "dh.csv"
+    path.write_text(f"d [m],a [m],{header}\n1,0,0,0\n0,1,{turn},0\n", encoding="utf-8")
+    if said:
+        with pytest.raises(ro.InputError, match=said):
+            read_sheet(path, "standard")
+    else:
+        arm = read_sheet(path, "standard")
+        assert arm.robot.mdh[1, 2] == pytest.approx(-np.pi / 2)
+        assert "column 'theta' states no unit: rad, as the other angles are." in arm.notes
 
 
 def test_a_written_table_has_one_system_of_units_and_reads_back_exactly(tmp_path: Path) -> None:

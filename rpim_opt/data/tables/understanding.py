@@ -182,7 +182,8 @@ def _readings(
     wanted = {*options.units, *robot.model.columns}
     for name, each in read.items():
         if ANOTHER_POINT.fullmatch(each.stem):
-            accepted = "one row per reading, those of several points with a column marker"
+            accepted = "one row per reading: those of a point below each other, with its joint values in every row, "
+            accepted += "or their means; those of several reflectors with a column marker"
             raise InputError("the header", f"column '{name}', another point or reading", accepted)
         if name.lower() in TURNED and each.stem in names and not (options.rotation or options.units.get("rx")):
             accepted = "roll, pitch, yaw; rx_deg, ry_deg, rz_deg; a quaternion; --rotation vector; --rotation "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -16,10 +16,10 @@ from pydantic import Field, model_validator
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, of_file, pick
 from rpim_opt.basics.files import read_json, read_toml, write_json, write_text
-from rpim_opt.basics.layout import PART_OF_PI, read_table
+from rpim_opt.basics.layout import PART_OF_PI, RawTable, read_table
 from rpim_opt.basics.schema import Angle, Length, Mass, Misfit, Table, validate
 from rpim_opt.basics.tables import csv_text, is_numeral
-from rpim_opt.basics.units import UNITS, accepted_units, display, split
+from rpim_opt.basics.units import DISPLAY, UNITS, accepted_units, display, split
 from rpim_opt.robot.chain import Chain, RobotSetup, describe, joint_values, standard_table, without_beta
 from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
@@ -35,14 +35,15 @@ CONVENTIONS = {"modified": "modified", "craig": "modified", "proximal": "modifie
                "standard": "standard", "paul": "standard", "distal": "standard", "classic": "standard",
                "hayati": "standard"}  # fmt: skip
 """What people call the conventions of Denavit-Hartenberg tables."""
-INDEX_BEFORE = re.compile(r"[_\s(\[{]*i\s*[-\u2212]\s*1[)\]}]*", re.IGNORECASE)
+INDEX_BEFORE = re.compile(r"[_\s(\[{]*(?:[ij]\s*[-\u2212]\s*1|ⱼ₋₁)[)\]}]*", re.IGNORECASE)
 """Of alpha and a of the link before: the table is modified."""
-INDEX = re.compile(r"[_\s(\[{]+i[)\]}]*(?=\s|$)")
+INDEX = re.compile(r"(?:[_\s(\[{]+i|ⱼ)[)\]}]*(?=\s|$)")
 """Of the joint itself, ``d(i)``, ``theta_i``: common to all conventions."""
-SHEET = {"\u03b1": "alpha", "θ": "theta", "β": "beta", "twist": "alpha", "theta offset": "theta", "offset": "theta",
-         "r": "a", "min": "lower", "minimum": "lower", "max": "upper", "maximum": "upper"}  # fmt: skip
-"""Other names of columns."""
-RANGE = re.compile(r"[\s_]*(?:range|limits?)[\s_]*")
+SHEET = {"\u03b1": "alpha", "\u237a": "alpha", "θ": "theta", "β": "beta", "twist": "alpha", "theta offset": "theta",
+         "offset": "theta", "r": "a", "min": "lower", "minimum": "lower", "max": "upper", "maximum": "upper",
+         "q\u207b": "lower", "q\u207a": "upper"}  # fmt: skip
+"""Other names of columns, those that the Robotics Toolbox prints among them."""
+RANGE = re.compile(r"[\s_]*(?:range|limits?|bereich|grenzen?)[\s_]*")
 """Beside the word of a limit, ``range min``, ``lower limit``; alone a column of both, which cells cannot hold."""
 SHEET_ORDER = ("theta", "d", "a", "alpha", "beta")  # of a data sheet in the standard convention
 JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")  # columns of the joints' own names
@@ -51,6 +52,7 @@ ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*�
 ANGLES = tuple(name for name, dimension in MDH_DIMENSION.items() if dimension == "angle")
 TURNS, NEARLY = {np.pi / 2: "pi/2", np.pi: "pi"}, 0.002
 """Angles [rad] of most tables, and what three digits of them miss at most."""
+LARGEST_TURN = 2 * np.pi  # [rad] in a table of a robot's links: larger numbers are degrees
 JOINT_NAME = re.compile(r"(?:joint|axis|link|achse|gelenk)[\s_]*\d+", re.IGNORECASE)  # in a cell
 WITHOUT_COLUMN = {"coupling": "a coupling of joints", "mounting": "a mounting elsewhere", "payload": "a payload"}
 """What a table with one row per joint has no place for."""
@@ -213,7 +215,7 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
         cells = [cell for cell in row if cell]
         if len(cells) > len(raw.columns) / 2 or any(map(is_numeral, cells)) or JOINT_NAME.fullmatch(cells[0]):
             raise InputError("the table", f"'{', '.join(cells)[:60]}', no row of numbers", "one row per joint")
-    columns = _sheet_columns(raw.columns)
+    columns, notes = _sheet_columns(raw)
     conventions = {convention, *(cell.lower() for cell in columns.pop("convention", []))} - {""}
     if any(INDEX_BEFORE.search(name) for name in raw.columns):
         conventions.add("modified")
@@ -228,28 +230,40 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
     if robot.gravity.masses and known != {"modified"}:
         raise InputError("the table", "masses of links in the frames of another convention", "--dh modified")
     arm = RobotSetup(robot) if known == {"modified"} else _from_standard(robot)
-    return replace(arm, notes=tuple(note for note in raw.notes if "is not a row of the table" in note))
+    return replace(arm, notes=(*(note for note in raw.notes if "is not a row of the table" in note), *notes))
 
 
-def _sheet_columns(header: Mapping[str, Sequence[Any]]) -> dict[str, list[str]]:
-    """Return the columns of a sheet as texts, by the keys of ``robot.toml``; without those of joints' names."""
+def _sheet_columns(raw: RawTable) -> tuple[dict[str, list[str]], list[str]]:
+    """Return the columns of a sheet as texts, by the keys of ``robot.toml``, and notes; without joints' names."""
     columns: dict[str, list[str]] = {}
-    for name, cells in header.items():
+    notes: list[str] = []
+    stated = {unit for stem, unit in map(_stem, raw.columns) if stem in ANGLES and unit}
+    for name, cells in raw.columns.items():
         texts = [str(cell) for cell in cells]
         stem, unit = _stem(name.partition(" #")[0])
+        unit = unit or raw.units.get(MDH_DIMENSION.get(stem, ""), "")
         if stem in JOINT_NAMES or not any(texts) or all(map(JOINT_NAME.fullmatch, texts)):
             continue
         if stem in ANGLES and not unit and any("°" in text for text in texts):
             unit = "deg"
         elif stem in ANGLES and not unit and any("pi" in text.lower() or "π" in text for text in texts):
             unit = "rad"
+        elif stem in ANGLES and not unit and len(stated) == 1:
+            turns = [_joint({f"{stem}_rad": text}).get(f"{stem}_rad") for text in texts]
+            degrees = any(isinstance(turn, float | int) and abs(turn) > LARGEST_TURN for turn in turns)
+            if not (degrees and "rad" in stated):  # radians in a column of degrees are refused below
+                (unit,) = stated
+                notes.append(f"column '{name}' states no unit: {unit}, as the other angles are.")
+        if stem in MDH_DIMENSION and not unit:
+            accepted = " or ".join(f"{stem} [{of[MDH_DIMENSION[stem]]}]" for of in (DISPLAY, SI))
+            raise InputError("the header", f"column '{name}' without a unit", accepted)
         if stem == "limits":
             raise InputError("the header", f"both limits in a column, '{name}'", "columns lower [deg] and upper [deg]")
         key = stem + (f"_{unit}" if unit else "")
         if key in columns:
-            raise InputError("the header", ", ".join(header), "every column once")
+            raise InputError("the header", ", ".join(raw.columns), "every column once")
         columns[key] = texts
-    return columns
+    return columns, notes
 
 
 def _stem(name: str) -> tuple[str, str]:
@@ -257,7 +271,7 @@ def _stem(name: str) -> tuple[str, str]:
     stem, unit = split(name)
     stem = INDEX.sub("", INDEX_BEFORE.sub("", stem).strip().lower())
     stem = RANGE.sub("", stem) or "limits"
-    return SHEET.get(stem, stem), unit
+    return SHEET.get(stem.replace("-", " "), stem), unit
 
 
 def _from_standard(robot: Robot) -> RobotSetup:
