@@ -412,8 +412,8 @@ def validate(
 
     Exit code 1 if an error is above the limit, the errors are significantly larger than those of the nominal robot
     (mean difference of their squares above three standard errors), or an input mistake is likely, a moved instrument
-    or base among them; 4 if no error is above the limit but fewer coordinates are inside their prediction intervals
-    than chance lets be.
+    or base among them; 4 if none of these, but together the rows contradict the calibration (chi-squared by their
+    predicted covariance, p-value below 0.01), as where the robot changed.
     """
     console.require_positive("--limit", limit)
     with _loaded(result) as (loaded, _):
@@ -424,7 +424,7 @@ def validate(
     text, within = _against(limit, "error", validation.largest)
     document = {**validation.content(), "limit_mm": limit, "within_limit": within}
     code = int(within is False or bool(validation.failure))
-    if within and not code and validation.uncovered:
+    if not code and validation.contradiction:
         code = CODES["inconclusive"]
     written = console.written_to(out, validation.csv())
     return Output("\n".join([str(validation), *text]), document, code, written, read)

@@ -16,6 +16,7 @@ from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.diagnosis import SLACK
 from rpim_opt.calibration.held_out import (
+    CHANGED,
     FEWEST,
     coverage_text,
     displacement,
@@ -27,7 +28,7 @@ from rpim_opt.calibration.held_out import (
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage
+from rpim_opt.calibration.uncertainty import held_out_errors
 from rpim_opt.calibration.verdict import Verdict, ambiguous_deviation, refuse_misread
 from rpim_opt.calibration.words import VAGUE, underdetermined
 from rpim_opt.data.dataset import Dataset
@@ -38,6 +39,7 @@ from rpim_opt.robot.parameters import of_session
 
 Conclusion = Literal["accepted", "rejected", "inconclusive"]
 MEASURED = 1000  # measured configurations of a block at which the uncertainty is compared with that of the region
+INVALID = "Missing: valid prediction intervals."
 MOST = 3  # joints or rows that a reason names
 STATED = 1e9  # degrees of freedom of an uncertainty that is stated
 WORST, BESIDE = 16, 16  # the search for the largest bound goes on from so many, at so many beside each
@@ -470,27 +472,24 @@ def _held_out(
         measured = any(region.rows(part.data).any() for part in result.problem.rows())
         reason = f"Missing: at least {FEWEST} held-out rows in the region; it holds {count} of {rows}."
         lacking.append(reason if measured else f"{reason} No identification row is in it either.")
-    if beyond:
-        lacking.append(
-            f"Missing: valid prediction intervals. Rows outside them: {listed(beyond, MOST)}. "
-            + (moved or "Repeat these measurements, or extend the model.")
-        )
+    if beyond or held.contradiction:
+        outside = f"Rows outside them: {listed(beyond, MOST)}." if beyond else ""
+        advice = moved or "Repeat these measurements, or extend the model."
+        if not moved and data is not None and held.contradiction:
+            advice = CHANGED
+        lacking.append(" ".join(filter(None, [INVALID, outside, held.contradiction, advice])))
     noise = 1e3 * instrument[inside].max(initial=0.0)
     what = "Held out" if data is None else "New measurements"
     sentence = f"{what}: {rows} rows, {count} of them in the region, maximum error there {largest:.3f} mm "
     sentence += f"(up to {noise:.3f} mm from the instrument alone)"
-    if held.coverage is not None:
-        share = coverage_text(held.coverage, rows)
-        sentence += f"; {share}"
-        if held.coverage < required_coverage(rows):
-            why = "" if beyond else moved
-            lacking.append(f"Missing: valid prediction intervals. Only {share}. {why}".rstrip())
+    sentence += "; " * (held.coverage is not None) + coverage_text(held)
     if not count:
         sentence = f"None of the {rows} held-out rows is in the region"
     if excluded:
         sentence += f". Not counted: held-out rows {listed(excluded, MOST)}, excluded from the fit to all rows"
     document: dict[str, Any] = {"rows": rows, "in_region": count, "largest_mm": largest, "missing": missing}
     document |= {"beyond": beyond, "excluded": excluded, "coverage95": held.coverage, "sentence": f"{sentence}."}
+    document["fit"] = held.fit and held.fit._asdict()
     return document, missed, lacking
 
 

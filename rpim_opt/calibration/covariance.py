@@ -12,6 +12,7 @@ from scipy.special import chdtrc, chdtri, stdtrit
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.quadratic import Ridge
+from rpim_opt.data.record import UNLIKELY
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.multi_robot import unknown_sessions
@@ -19,7 +20,6 @@ from rpim_opt.problem.problem import CalibrationProblem
 
 Interval = Literal["mean", "reached", "reading"]
 UNDECIDED = 1e-9  # a position depends on an undecided direction that makes more than this share of its movement
-UNLIKELY = 0.01  # probability below which the noise is said to be another than stated
 
 
 @dataclass(frozen=True, eq=False)

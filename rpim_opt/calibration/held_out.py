@@ -11,17 +11,20 @@ from scipy.special import fdtrc
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
-from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage
+from rpim_opt.calibration.uncertainty import held_out_errors
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.pose import pose, position
-from rpim_opt.data.record import HeldOut
+from rpim_opt.data.record import UNLIKELY, HeldOut
 from rpim_opt.problem.diagnosis import common_rows
 from rpim_opt.problem.registration.closed_forms import register, transformed
 from rpim_opt.robot.parameters import Parameters, of_session, session_prefix
 
 FEWEST = 5  # held-out rows below which they are too few to judge
+CHANGED = (
+    "If the robot changed, recalibrate by `update`, which names the change; otherwise repeat these measurements, or "
+    "extend the model."
+)
 GROSS = 6.0  # factor on the median distance from which on a row does not count for a registration
 
 
@@ -30,10 +33,12 @@ def rows_used(result: Calibration, data: Dataset) -> dict[str, str]:
     return dict(common_rows(result.problem.sample().data, data))
 
 
-def coverage_text(coverage: float, rows: int) -> str:
-    """Return the coverage of 95 % prediction intervals, beside the `required_coverage`, as text."""
-    share = f"{100 * coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
-    return f"{share} (at least {100 * required_coverage(rows):.0f} % are required for this number of rows)"
+def coverage_text(held: HeldOut) -> str:
+    """Return how held-out rows agree with their prediction as text; empty without one."""
+    if held.coverage is None:
+        return ""
+    share = f"{100 * held.coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
+    return share if held.fit is None else f"{share} ({held.fit})"
 
 
 def registration(free: Parameters, data: Dataset) -> str:
@@ -45,15 +50,14 @@ def registration(free: Parameters, data: Dataset) -> str:
 def displacement(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
     """Return sentences on a common displacement of the measurements, by registration: as mistake or as remark.
 
-    It is reported where rows are outside their prediction intervals, or too many coordinates are. A mistake is a motion
+    It is reported where rows are outside their prediction intervals, or contradict them together. A mistake is a motion
     that takes more than half of the RMS error, for its six degrees of freedom, of rows that are outside; a remark one
     whose part of the squared errors chance would give with probability 0.01 (Fisher's F). Both are empty otherwise.
     """
     vectors = result.error_vectors(data)
     rows = np.flatnonzero(np.isfinite(vectors).all(axis=1))
     far = bool((held.sigmas > held.allowed)[rows].any())
-    lacking = held.coverage is not None and held.coverage < required_coverage(len(data))
-    if len(rows) < FEWEST or not (far or lacking):
+    if len(rows) < FEWEST or not (far or held.contradiction):
         return "", ""
     try:
         again, motion = registered(result, data)

@@ -6,18 +6,20 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import bdtr, fdtri
+from scipy.linalg import block_diag
+from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import Tabled, listed
 from rpim_opt.bayes.hyperparameters import sessions_log_std
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.transmission import series
-from rpim_opt.calibration.covariance import UNLIKELY, coverage_factor, noise_covariances, position_noise, row_dof
+from rpim_opt.calibration.covariance import coverage_factor, noise_covariances, position_noise, row_dof
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.pose import position
-from rpim_opt.data.record import CONFIDENCE, HeldOut
+from rpim_opt.data.record import CONFIDENCE, Fit, HeldOut
+from rpim_opt.problem.multi_robot import identifying_sessions
 from rpim_opt.robot.parameters import of_session
 from rpim_opt.robot.terms import transmission
 
@@ -215,8 +217,11 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
 def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None = None) -> HeldOut:
     """Return the errors of a calibration on measurements that it did not use, beside their prediction intervals.
 
-    The coverage is that of the rows that are ``counted`` (N,), by default all. Where sessions stand apart, rows of one
-    that was not measured have no interval.
+    Coverage and fit are those of the rows that are ``counted`` (N,), by default all. Where sessions stand apart, rows
+    of one that was not measured have no interval. The fit is by the joint prediction of r, with the covariances V of
+    readings and C of the deviations, which all rows share::
+
+        chi^2 = r' (V + A C A')^-1 r = |u|^2 - u' B (I + B' B)^-1 B' u,    u = V^-1/2 r,    B = V^-1/2 A C^1/2
     """
     N = len(data)
     sigmas, allowed = np.full((2, N), np.nan)
@@ -227,28 +232,47 @@ def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None =
         return held
     counted = np.ones(N, dtype=bool) if counted is None else counted
     inside: list[np.ndarray] = []
-    problem = result.problem.on(data)
-    parts = by_block(problem, np.column_stack(problem.slopes(result.x)))
+    whitened: list[np.ndarray] = []
+    problem = identifying_sessions(result.problem.on(data))
+    scale = problem.parameters.free.scale
+    new = scale[len(C) :]  # of sessions that the calibration does not know
+    parts = by_block(problem, np.column_stack(problem.slopes(np.append(result.x, np.zeros_like(new)))))
+    C = np.asarray(block_diag(C, np.diag(new**2)), dtype=float)
     known = np.isfinite(np.diag(C))
     C = np.where(np.outer(known, known), C, 0.0)
-    added = noise_covariances(problem, result.variance_factor)
-    for (block, part), reading, session in zip(parts, added.reading, added.session, strict=True):
+    s, U = np.linalg.eigh(C / np.outer(scale, scale))
+    root = scale[:, None] * U * np.sqrt(np.maximum(s, 0.0))
+    freedom = np.inf
+    for (block, part), reading in zip(parts, noise_covariances(problem, result.variance_factor).reading, strict=True):
         k = len(block.measurement.components)
-        r, A = part[:, :, 0], part[:, :, 1:]
-        S = A @ C @ A.transpose(0, 2, 1) + reading
+        r, A, V = part[:, :, 0], part[:, :, 1:], np.broadcast_to(reading, (len(part), k, k))
+        S = A @ C @ A.transpose(0, 2, 1) + V
+        of_new = A[:, :, len(result.x) :] * new
+        session = of_new @ of_new.transpose(0, 2, 1)
         dof = row_dof(result.noise_dof, sessions_log_std(result.learned), S, session)
         squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)
         predicted = (A[:, :, ~known] == 0).all(axis=(1, 2))
-        predicted &= np.einsum("nkk->n", session - UNINFORMATIVE * (reading - session)) < 0
+        predicted &= np.einsum("nkk->n", session - UNINFORMATIVE * V) < 0
         sigmas[block.row] = np.where(predicted, np.sqrt(squares), np.nan)
         limit = np.sqrt(k * fdtri(k, dof, 1 - RARE / N))
         allowed[block.row] = np.where(predicted, limit, np.nan)
         lengths = np.array([d in ("length", "pixel") for d in block.measurement.components.values()])
         factor = coverage_factor(dof, CONFIDENCE)[:, None]
         within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
-        inside.append(within[predicted & counted[block.row]][:, lengths].ravel())
-    covered = np.concatenate(inside)
-    return replace(held, coverage=float(covered.mean()) if len(covered) else None)
+        judged = predicted & counted[block.row]
+        inside.append(within[judged][:, lengths].ravel())
+        rows = np.linalg.solve(
+            np.linalg.cholesky(V[judged]), np.concatenate([r[judged, :, None], A[judged] @ root], axis=2)
+        )
+        whitened.append(rows.reshape(-1, 1 + len(root)))
+        freedom = min(freedom, float(dof[judged].min(initial=np.inf)))
+    covered, whole = np.concatenate(inside), np.concatenate(whitened)
+    if not len(whole):
+        return held
+    u, B = whole[:, 0], whole[:, 1:]
+    squares = u @ u - (B.T @ u) @ np.linalg.solve(np.eye(len(root)) + B.T @ B, B.T @ u)
+    share = float(covered.mean()) if len(covered) else None
+    return replace(held, coverage=share, fit=Fit.of(float(squares), len(u), freedom))
 
 
 def unregistered(result: Outcome, data: Dataset, held: HeldOut) -> str:
@@ -258,8 +282,3 @@ def unregistered(result: Outcome, data: Dataset, held: HeldOut) -> str:
     sessions = {*data.session[np.isnan(held.sigmas)]} - {*result.problem.sample().data.session}
     named = listed(sorted(f"'{name}'" for name in sessions))
     return named and f"The registration of session {named} is unknown: register its rows (--register)."
-
-
-def required_coverage(rows: int) -> float:
-    """Return the share of coordinates in 95 % intervals that so many rows, each counted once, rarely fall below."""
-    return float(np.sum(bdtr(np.arange(rows + 1), rows, CONFIDENCE) < UNLIKELY)) / rows

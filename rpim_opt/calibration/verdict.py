@@ -15,7 +15,7 @@ from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.basics.units import fits
 from rpim_opt.calibration.diagnosis import flagged
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage, unregistered
+from rpim_opt.calibration.uncertainty import held_out_errors, unregistered
 from rpim_opt.convex.constraints import name_of
 from rpim_opt.convex.program import pose
 from rpim_opt.convex.robust_loss import by_place
@@ -432,7 +432,7 @@ def implausible(result: Outcome, held: HeldOut) -> str:
     from few rows explains them, nothing is.
     """
     error, most = held.error, REACH * arm_length(result.problem)
-    if held.coverage is not None and held.coverage >= required_coverage(len(error)):
+    if held.fit is not None and held.fit.likely:
         return ""
     if not np.isfinite(error).any() or np.nanmedian(error) <= most or np.nanmedian(result.errors()) > most:
         return ""

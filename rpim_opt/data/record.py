@@ -9,14 +9,17 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import NamedTuple
 
+from scipy.special import fdtrc
+
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import joined, version_of
+from rpim_opt.basics.text import joined, three_digits, version_of
 from rpim_opt.data.dataset import Dataset
 
 PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
 Side = tuple[float, float]
 CONFIDENCE = 0.95  # probability with which a limit is to be kept, where no other is stated
+UNLIKELY = 0.01  # p-value below which readings contradict what is stated or predicted of them
 
 
 @dataclass(frozen=True)
@@ -67,6 +70,27 @@ class Requirement:
         return f"{box}joints {limited} within the stated ranges, others within the measured ones"
 
 
+class Fit(NamedTuple):
+    """Chi-squared of readings about what a calibration predicts of them, over how many equations, and its p-value."""
+
+    squares: float
+    equations: int
+    probability: float
+
+    @classmethod
+    def of(cls, squares: float, equations: int, dof: float) -> Fit:
+        """Return the fit by Fisher's F, with predictions whose noise is known to so many degrees of freedom."""
+        return cls(squares, equations, float(fdtrc(equations, max(dof, 1.0), squares / equations)))
+
+    @property
+    def likely(self) -> bool:
+        """Whether chance explains it."""
+        return self.probability >= UNLIKELY
+
+    def __str__(self) -> str:
+        return f"chi-squared {three_digits(self.squares)} of {self.equations}, p-value {self.probability:.2g}"
+
+
 @dataclass(frozen=True, eq=False)
 class HeldOut:
     """Errors of a calibration on N rows that it did not use.
@@ -80,7 +104,8 @@ class HeldOut:
     instrument's as the row states it, and the repeatability) and C the calibration's; ``allowed`` (N,) their limit by
     Fisher's F, which one of all N exceeds with probability 0.01. Both are NaN where the calibration has no covariance,
     or none in a direction that the row depends on. ``coverage`` is the share of lengths in the 95 % interval of a
-    reading, without rows that a final fit excludes; None without covariance.
+    reading, ``fit`` how well all equations together agree with their joint prediction, S of all rows; both without rows
+    that a final fit excludes, and None without covariance.
     """
 
     label: tuple[str, ...]
@@ -91,6 +116,14 @@ class HeldOut:
     sigmas: Array
     allowed: Array
     coverage: float | None = None
+    fit: Fit | None = None
+
+    @property
+    def contradiction(self) -> str:
+        """A sentence if the rows contradict the calibration, by more than chance explains; otherwise empty."""
+        if self.fit is None or self.fit.likely:
+            return ""
+        return f"Together the rows contradict the calibration: {self.fit}."
 
 
 class Earlier(NamedTuple):

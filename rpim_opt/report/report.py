@@ -189,7 +189,7 @@ def _accuracy(content: Content) -> Iterator[Block]:
         if held is None and record.validation is not None:
             held = held_out_errors(result, record.validation)
         if held is not None and held.coverage is not None:
-            notes.append(f"Held-out rows: {coverage_text(held.coverage, len(held.label))}.")
+            notes.append(f"Held-out rows: {coverage_text(held)}.")
     yield "text", notes
     head = ["data, model", *summary.COLUMNS]
     rows = [row for row in summary.error_rows(result) if row["count"]]

@@ -9,7 +9,7 @@ from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import fdtrc, logsumexp
+from scipy.special import logsumexp
 
 from rpim_opt.basics.arrays import Array, rms, statistics
 from rpim_opt.basics.exceptions import InputError
@@ -28,7 +28,7 @@ from rpim_opt.convex.expressions import SQUARES
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.quadratic import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.record import Earlier, HeldOut, Record
+from rpim_opt.data.record import Earlier, Fit, HeldOut, Record
 from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
@@ -53,22 +53,6 @@ SHOWN = 5  # causes that are shown
 BASE = "base_"
 OF_ROBOT = ("robot_serial", "controller")  # details of a record that stay when the robot is measured again
 UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "  # What title and source of an updated calibration say.
-
-
-class Fit(NamedTuple):
-    """Chi-squared of readings about what a prior predicts of them, over how many equations, and its p-value."""
-
-    squares: float
-    equations: int
-    probability: float
-
-    @property
-    def likely(self) -> bool:
-        """Whether its p-value is above 0.01."""
-        return self.probability >= FALSE_ALARM
-
-    def __str__(self) -> str:
-        return f"chi-squared {three_digits(self.squares)} of {self.equations}, p-value {self.probability:.2g}"
 
 
 class Cause(NamedTuple):
@@ -598,7 +582,7 @@ class Misfit:
 
     def __init__(self, result: Calibration, model: LinearModel, prior: Quadratic, reset: Sequence[int] = ()) -> None:
         sigma = np.sqrt(result.variance_factor)
-        self.noise_dof = max(result.noise_dof, 1.0)
+        self.noise_dof = result.noise_dof
         self.m = len(model.b)
         self.A = model.A / sigma
         self.L = prior.matrix / sigma
@@ -611,7 +595,7 @@ class Misfit:
         # as many degrees of freedom as there are readings, less those that parameters without a prior take
         taken = int(np.linalg.matrix_rank(self.A[:, list(reset)])) if len(reset) else 0
         freedom = max(self.m - taken, 1)
-        self.fit = Fit(squares, freedom, self._p_value(squares, freedom))
+        self.fit = Fit.of(squares, freedom, self.noise_dof)
 
     def projected(self, rows: slice | np.ndarray, values: Array) -> tuple[Array, Array]:
         """Return g (p,) and G (p, p) of a change, from the ``values`` of D in some rows and zeros in the others."""
@@ -627,10 +611,7 @@ class Misfit:
         if not observed.any():
             return cause
         gain = float(np.sum((U[:, observed].T @ g) ** 2 / s[observed]))
-        return cause._replace(gain=gain, p_value=self._p_value(gain, int(observed.sum())))
-
-    def _p_value(self, squares: float, m: int) -> float:
-        return float(fdtrc(m, self.noise_dof, squares / m))
+        return cause._replace(gain=gain, p_value=Fit.of(gain, int(observed.sum()), self.noise_dof).probability)
 
 
 def candidates(free: Parameters, data: Dataset, reset: Sequence[str] = ()) -> list[Cause]:

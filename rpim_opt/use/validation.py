@@ -12,9 +12,9 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import coverage_text
+from rpim_opt.calibration.held_out import CHANGED, coverage_text
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import held_out_errors, required_coverage, unregistered
+from rpim_opt.calibration.uncertainty import held_out_errors, unregistered
 from rpim_opt.calibration.verdict import implausible, misread, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset
@@ -59,11 +59,6 @@ class Validation(HeldOut):
         return self.mistake or self.worse
 
     @property
-    def uncovered(self) -> bool:
-        """Whether fewer coordinates are inside their prediction intervals than chance explains."""
-        return self.coverage is not None and self.coverage < required_coverage(len(self.label))
-
-    @property
     def beyond(self) -> tuple[int, ...]:
         """Rows outside their prediction intervals, the worst first."""
         order = np.argsort(-np.nan_to_num(self.sigmas / self.allowed))
@@ -79,6 +74,7 @@ class Validation(HeldOut):
             "orientation": statistics(self.angle, "mrad"),
             "beyond": [self.label[i] for i in self.beyond],
             "coverage95": self.coverage,
+            "fit": self.fit and self.fit._asdict(),
             "outside": [self.label[i] for i in self.outside.rows],
             "touched": [dict(each) for each in self.touched],
             "remarks": self.remarks,
@@ -112,7 +108,10 @@ class Validation(HeldOut):
         largest = ""
         if np.isfinite(self.error).any():
             largest = f"Largest error: row {self.label[np.nanargmax(self.error)]}, {1e3 * self.largest:.3f} mm."
-        covered = "" if self.coverage is None else f" {coverage_text(self.coverage, len(self.label))}."
+        covered = f" {coverage_text(self)}." if self.coverage is not None else ""
+        contradicted = self.contradiction
+        if contradicted and not self.failure:
+            contradicted = f"{contradicted} {CHANGED}"
         named = [
             f"{self.label[i]} ({self.sigmas[i]:.1f} standard deviations, {1e3 * self.error[i]:.3f} mm)"
             for i in self.beyond
@@ -122,7 +121,7 @@ class Validation(HeldOut):
             judgement = self.no_intervals or "No row has a prediction interval: data and penalty do not determine it."
         elif not named:
             judgement = f"No row is outside its prediction interval.{covered}"
-        every = [self.worse, largest, judgement, *self.outside.sentences(), *self.remarks, self.mistake]
+        every = [self.worse, largest, judgement, contradicted, *self.outside.sentences(), *self.remarks, self.mistake]
         return [sentence for sentence in every if sentence]
 
     def __str__(self) -> str:

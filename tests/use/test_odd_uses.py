@@ -260,13 +260,11 @@ def test_rows_of_an_instrument_that_moved_are_named() -> None:
     assert "If the instrument or the base moved, use --register" in str(
         rejected
     )  # a good robot is not rejected without a hint
-    # by less than a row's interval: too few coordinates are inside theirs
+    # by less than a row's interval: together the rows contradict the calibration
     moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([6e-5, -6e-5, 6e-5])),))
     found, accepted = ro.use.validate(result, moved), ro.calibration.accept(result, requirement, moved)
     assert not found.mistake
-    assert "are required for this number of rows). The measurements are displaced as a whole by 0.1 mm" in " ".join(
-        str(found).split()
-    )
+    assert "The measurements are displaced as a whole by 0.1 mm" in str(found)
     assert accepted.verdict == "inconclusive"
     assert accepted.reasons[-1].endswith("If the instrument was moved since the calibration, use --register.")
     assert not ro.use.validate(result, moved, register=True).remarks[1:]

@@ -103,6 +103,23 @@ def test_what_changed_is_named_with_its_size(updated) -> None:
     assert "theta4" in text
 
 
+def test_rows_of_a_robot_that_changed_accept_nothing(monkeypatch, capsys, tmp_path, first) -> None:
+    """All of `accept`, `validate` and `update` judge them together, where every one is in its own interval."""
+    robot = happened(3, theta5=5e-4)
+    ro.store.save_result(first, tmp_path / "result.json")
+    (tmp_path / "new.csv").write_text(table(robot.after), encoding="utf-8")
+    found = ro.use.validate(first, robot.after)
+    before = ro.use.update(first, robot.after).before
+    assert tuple(found.fit) == pytest.approx(tuple(before), rel=1e-3)  # the formula, and a fit at its own linearization
+    assert not found.beyond
+    assert found.fit.probability < 0.01
+    for words in (["validate", str(tmp_path), str(tmp_path / "new.csv")],
+                  ["accept", str(tmp_path), "--data", str(tmp_path / "new.csv"), "--limit", "1"]):  # fmt: skip
+        assert run(monkeypatch, *words) == 4
+        text = capsys.readouterr().out
+        assert f"contradict the calibration: {found.fit}. If the robot changed, recalibrate by `update`" in text
+
+
 def test_nothing_is_accused_where_nothing_changed() -> None:
     robot = happened(5)
     found = ro.use.update(ro.calibrate(robot.problem), robot.after)
