@@ -32,12 +32,12 @@ from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import OF_JOINTS, RobotSetup, placed, same_place
-from rpim_opt.robot.formats.tables import CONVENTIONS, read_robot, rounded, write_robodk, write_robot
+from rpim_opt.robot.formats.tables import CONVENTIONS, joints_alone, read_robot, rounded, write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import read_ur_kinematics, write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, remembered_ends, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.library import robots
-from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 from rpim_opt.use.compensation import tool_uncertainty, turns_measured
 from rpim_opt.use.sessions import base_frame, in_session, session_notes
@@ -168,7 +168,7 @@ def export_files(
     ]
     made: list[tuple[str | Path | None, Callable[[Path], Any]]] = [
         (mdh, lambda target: _write_table(identified(result, marker, robot), dh, target)),
-        (robodk, lambda target: write_robodk(identified(result, marker, robot).robot, target)),
+        (robodk, lambda target: _write_robodk(identified(result, marker, robot), target)),
     ]
     sources = [(Path(source), write) for source, write in corrected if source]
     if sources and out is None:
@@ -276,16 +276,30 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
 
 
 def _write_table(arm: RobotSetup, dh: str, target: Path) -> list[str]:
-    """Write a DH table, with a note on its convention."""
-    write_robot(rounded(arm.robot), target, dh)
+    """Write a DH table, with notes on its convention and on what one with a row per joint has no place for."""
+    robot, counted = arm.robot, []
+    if target.suffix.lower() == ".csv":
+        robot = replace(robot, gravity=Gravity(masses=robot.gravity.masses, centres=robot.gravity.centres))
+        if not np.array_equal(np.abs(robot.joint_map), np.eye(len(robot.mdh))):
+            robot, counted = joints_alone(robot, target)
+    write_robot(rounded(robot), target, dh)
     convention = CONVENTIONS[dh.lower()]
     alpha, a = arm.robot.mdh[0, :2]
     base, inside = arm.base, ""
     if convention == "standard" and (alpha or a):
         base = frame_numbers(numeric_frame(base) @ numeric_link(alpha, a))
         inside = f" Its base contains alpha1 = {1e3 * alpha:.4g} mrad and a1 = {1e3 * a:.4g} mm, which place axis 1."
-    ends = f"base {placed(base)} in the instrument's frame, reflector {placed(arm.tool)} in {FLANGE}"
-    return [f"{target.name}: {CONVENTION[convention]}.{inside}", f"{target.name} lacks base and tool: {ends}."]
+    return [f"{target.name}: {CONVENTION[convention]}.{inside}", _ends(replace(arm, base=base), target), *counted]
+
+
+def _write_robodk(arm: RobotSetup, target: Path) -> list[str]:
+    return [*write_robodk(arm.robot, target), _ends(arm, target)]
+
+
+def _ends(arm: RobotSetup, file: Path) -> str:
+    """Return a sentence on base and tool, which a file does not hold."""
+    ends = f"base {placed(arm.base)} in the instrument's frame, reflector {placed(arm.tool)} in {FLANGE}"
+    return f"{file.name} lacks base and tool: {ends}."
 
 
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:

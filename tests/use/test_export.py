@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.robot.kinematics import forward_kinematics
+from rpim_opt.robot.library import read_arm
 from tests.robot.test_exchange import CONF, UR10, YAML, configurations, reach, yaml_kinematics
-from tests.simulate import simulated
+from tests.simulate import ARM, simulated
 
 
 def poses(text: str) -> list[Array]:
@@ -62,3 +64,20 @@ def test_files_of_universal_robots_state_the_tcp_and_the_base_that_belong_to_the
     missed = base @ flange @ tcp - wanted
     assert np.abs(missed[:, :3, 3]).max() < 4e-5  # a rotation of 1e-5 rad, as is printed, 2 m away, and micrometres
     assert np.abs(missed[:, :3, :3]).max() < 4e-5
+
+
+@pytest.mark.parametrize("made", [{"mdh": "arm.csv", "dh": "standard"}, {"mdh": "arm.csv"}, {"robodk": "arm.csv"}])
+def test_a_table_of_coupled_joints_says_how_the_controller_counts_them(tmp_path: Path, made: dict[str, str]) -> None:
+    coupling = np.eye(6)
+    coupling[2, 1] = -1.0
+    carrying = ARM.gravity.carrying(20.0, (0.0, 0.0, 0.1))
+    problem, truth = simulated(("theta?", "d[1346]"), robot=replace(ARM, joint_map=coupling, gravity=carrying))
+    result = replace(ro.calibrate(problem, "tikhonov", 1.0), x=truth)
+    file = tmp_path / "arm.csv"
+    notes = " ".join(ro.use.export_files(result, **{**made, next(iter(made)): file}, despite_verdict=True).notes)
+    assert "arm.csv: with the calibration's joint values q its joint 3 is at -1 q2 +1 q3" in notes
+    assert "arm.csv lacks base and tool: base x 0.000" in notes
+    q = configurations(6)
+    read = read_arm(file, convention="modified" if "robodk" in made else "").robot
+    missed = forward_kinematics(read, q @ coupling.T) - forward_kinematics(result.robot, q)
+    assert np.abs(missed).max() < 1e-9  # nine decimals of mm and degrees

@@ -352,6 +352,12 @@ def rounded(robot: Robot) -> Robot:
     return replace(robot, mdh=(np.round(robot.mdh / units, 9) + 0.0) * units)
 
 
+def joints_alone(robot: Robot, file: Path) -> tuple[Robot, list[str]]:
+    """Return the robot with joints that turn by their own values, and a sentence on how the controller counts those."""
+    alone = replace(robot, joint_map=np.empty((0, 0)), limits=np.empty((0, 0)))
+    return alone, joint_values(robot, alone, file)
+
+
 def write_robodk(robot: Robot, path: str | Path) -> list[str]:
     """Write the four modified DH numbers of every joint as CSV, ``joint,alpha_deg,a_mm,theta_deg,d_mm``.
 
@@ -362,7 +368,7 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
     axes so nearly parallel that rounded numbers lose the robot; refused is a beta after the last joint.
     """
     table = without_beta(robot).mdh
-    notes = joint_values(robot, replace(robot, joint_map=np.empty((0, 0)), limits=np.empty((0, 0))), Path(path))
+    notes = joints_alone(robot, Path(path))[1]
     units = {c: display(MDH_DIMENSION[c]) for c in MDH[:4]}
     far = [f"d{i} = {1e3 * d:.0f} mm" for i, d in enumerate(table[:, 3], start=1) if abs(d) > FAR]
     numbers = table[:, :4] / [si for _, si in units.values()]
