@@ -19,7 +19,7 @@ from rpim_opt.basics.threads import on_all_cores, one_blas_thread
 from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.calibration.acceptance import accept
 from rpim_opt.calibration.covariance import FitCovariance, noise_covariances, position_noise
-from rpim_opt.calibration.diagnosis import Outside
+from rpim_opt.calibration.diagnosis import SLACK, Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
@@ -47,7 +47,8 @@ FIRST = np.array([1, 1, 1, 1e-3, 1e-3, 1e-3])  # weights [m/rad] of an error wit
 STILL = 1e-9  # weight [m^2/rad^2] of the joints' motion there: no singular wrist swings to keep an orientation
 KEPT = np.array([1, 1, 1, 1e-4, 1e-4, 1e-4])  # `REACHED` is 1e-7 m, and 1 mrad where orientations are kept
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
-BANK, TRIALS = 2000, 12  # configurations among which starts of a pose without one are sought; how many it tries
+BANK = 2000  # configurations among which starts of a pose without one are sought
+TRIALS, MORE = 12, 36  # how many it tries in the measured ranges and then outside; in the ranges, where that reached it
 NULL_SPACE_WEIGHT = 1e-10  # weight of a correction that moves nothing, relative to the largest squared singular value
 STEP_TOLERANCE = 1e-10
 DECREASE_TOLERANCE = 1e-6
@@ -264,13 +265,14 @@ def compensate(
 
     **Targets.** ``q`` (N, dof) are commands of the nominal controller [rad or m], ``poses`` targets in the base, (N, 7)
     x, y, z [m] and unit quaternion, w first, or (N, 3) positions. With both, ``q`` is where to look for the poses;
-    without ``q`` every pose is looked for from several configurations within the limits that come near. ``label`` names
-    the rows, ``robot`` is which of several.
+    without ``q`` every pose is looked for from several configurations that come near, in the measured joint ranges, and
+    where none of these leads to it within the limits. ``label`` names the rows, ``robot`` is which of several.
 
     **Orientation.** Position comes first: where this leaves some of p, |w|^2 counts 1e-6 m^2 instead, and |D|^2 1e-9
-    m^2 rad^-2. So it does where the standard uncertainty of an orientation is larger than w, as where positions of one
-    reflector hardly determine it; w is then the turn by which the correction changes it. ``orientation=True`` corrects
-    all orientations, at the cost of positions where both cannot be had; with ``False`` those of targets are ignored.
+    m^2 rad^-2. So it does for all targets where the standard uncertainty of one's orientation is larger than its w, as
+    where positions of one reflector hardly determine it; w is then the turn by which the correction changes it: rows of
+    a program would turn against each other. ``orientation=True`` corrects all orientations, at the cost of positions
+    where both cannot be had; with ``False`` those of targets are ignored.
 
     **Tool.** Both robots have the same tool, so that no difference of tools is compensated: ``tool`` (6,) in the flange
     frame, x, y, z [m], roll, pitch, yaw [rad], the controller's TCP, or by default the reflector of the calibration
@@ -333,6 +335,8 @@ def compensate(
             " Targets without joint values are sought in the measured joint ranges first, and may be reached in "
             "another arm configuration: state q1, ... with them."
         )
+        if outside.rows:
+            point += f" No solution in these ranges was found for {listed([targets.label[i] for i in outside.rows])}."
     found = Compensation(
         result.problem.arms[robot], targets.label, **whole, outside=outside, note=" ".join(filter(None, notes)),
         point=point, limit=limit, source=result.record.identity,
@@ -363,17 +367,22 @@ def _less_certain(reflector: _Cell, found: Compensation, targets: Targets) -> st
 
 
 def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool | None) -> tuple[dict[str, Any], str]:
-    """Return the fields of all rows, and why orientations are not corrected, where they are not."""
-
-    def corrected(start: int) -> dict[str, Array]:
-        some = Targets._make(None if each is None else each[start : start + BLOCK] for each in targets)
-        return cell.corrected(some, largest, orientation)
-
-    parts = on_all_cores(corrected, range(0, len(targets.label), BLOCK))
+    """Return the fields of all rows, and whether orientations are corrected where nobody says so."""
+    starts = range(0, len(targets.label), BLOCK)
+    blocks = [Targets._make(None if v is None else v[i : i + BLOCK] for v in targets) for i in starts]
+    aims = on_all_cores(cell.aim, blocks)
+    choice = orientation is None and cell.kind is pose
+    vague = 0  # one row that turns alone would turn against the others
+    if choice:
+        vague = sum(on_all_cores(lambda i: cell.vague_orientations(blocks[i], aims[i]), range(len(blocks))))
+    parts = on_all_cores(lambda i: cell.corrected(blocks[i], aims[i], largest, not vague, choice), range(len(blocks)))
     fields: dict[str, Any] = {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
-    kept = np.count_nonzero(~fields.pop("turning"))
-    rows, known = f"{kept} of {len(targets.label)} targets", "its uncertainty is unknown, or larger than its correction"
-    why = f" Orientation of {rows} is not corrected: {known}; --orientation corrects it anyway." if kept else ""
+    why = " Orientations of all targets are corrected." if choice else ""
+    if vague:
+        why = (
+            f" Orientations are not corrected: those of {vague} of {len(targets.label)} targets are known no better "
+            "than by the nominal robot; --orientation corrects them anyway."
+        )
     there, targets_at = fields.pop("there"), fields.pop("targets_at")
     if len(there) >= MOVED:
         with suppress(InputError):
@@ -421,6 +430,17 @@ def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
 # --- the controller's robot beside the identified one ------------------------------------------------------
 
 
+class _Aim(NamedTuple):
+    """What the nominal controller commands for N targets, and whether it reaches them."""
+
+    commands: Array  # (N, dof)
+    target: Array  # (N, c)
+    load: Array  # (N, l)
+    missed: Array  # (N, k) errors that are left
+    beside: Array  # (N,) see `Compensation`
+    reached: np.ndarray
+
+
 class _Cell(NamedTuple):
     """The controller's robot, the identified one, and the uncertainty of where that is."""
 
@@ -437,6 +457,7 @@ class _Cell(NamedTuple):
     noise: Array  # covariance (k, k) [SI] of a reading
     level: float  # the noise's variance over that
     point: str  # sentence on the point that is moved
+    ranges: Array  # (2, dof) measured joint ranges, those of earlier calibrations included
 
     @classmethod
     def of(
@@ -493,14 +514,11 @@ class _Cell(NamedTuple):
             robot, kind, Arm.of(robot, nominal, nominal, prefix, np.eye(4), kind, loads),
             Arm.of(robot, identified, nominal, prefix, moved, kind, loads), loads, problem, x[p.identified],
             own, None if result.no_intervals else result.fit_covariance, marker, noise, result.variance_factor, point,
+            result.ranges[which],
         )  # fmt: skip
 
-    def corrected(self, targets: Targets, largest: float, orientation: bool | None) -> dict[str, Array]:
-        """Return the fields of a `Compensation` for some targets, and which orientations are ``turning`` (N,).
-
-        ``there`` (N, 3) are the positions of uncorrected commands, ``targets_at`` (N, 3) where the nominal robot has
-        them.
-        """
+    def aim(self, targets: Targets) -> _Aim:
+        """Return the uncorrected commands of some targets, and what these miss."""
         _, q, poses, torque, payload = targets
         N = len(targets.label)
         borne = [] if torque is None else [torque @ np.linalg.inv(self.robot.joint_map)]
@@ -515,17 +533,28 @@ class _Cell(NamedTuple):
             missed = self.nominal.at(commands, load, poses)[1]
             if q is not None:
                 beside = self.norms(self.nominal.at(q, load, poses)[1])[0]
+        counts = attainable(self.identified.at(commands, load, target)[2])
+        return _Aim(commands, target, load, missed, beside, self._reached(missed, counts))
+
+    def vague_orientations(self, targets: Targets, aim: _Aim) -> int:
+        """Return how many orientations that can be reached are known no better than by the nominal robot."""
+        missed = self.norms(self.identified.at(aim.commands, aim.load, aim.target)[1])[1]
+        known = missed >= self.uncertainty(aim.commands, targets)[1]
+        return int(np.count_nonzero(aim.reached & ~known))
+
+    def corrected(self, targets: Targets, aim: _Aim, largest: float, turning: bool, choice: bool) -> dict[str, Array]:
+        """Return the fields of a `Compensation` for some targets, with their orientations or, not ``turning``, without.
+
+        Of a ``choice`` positions come first. ``there`` (N, 3) are the positions of uncorrected commands, ``targets_at``
+        (N, 3) where the nominal robot has them.
+        """
+        commands, target, load, missed, beside, reached = aim
         pose_before, before, J = self.identified.at(commands, load, target)
-        k, n = J.shape[1:]
+        N, k, n = J.shape
         counts = np.broadcast_to(attainable(J), (N, k, k))
-        reached = self._reached(missed, counts)
-        choice = orientation is None and self.kind is pose
-        turning = np.full((N, 1), True)
-        if choice:
-            turning[:, 0] = self.norms(before)[1] >= self.uncertainty(commands, targets)[1]
         wanted = np.where(turning | (np.arange(target.shape[1]) < 3), target, pose_before)
         due = np.where(reached[:, None] & (turning | (np.arange(k) < 3)), before - missed, 0.0)
-        W = counts * np.where(turning, 1.0, FIRST[:k])[:, None]
+        W = counts if turning else counts * FIRST[:k]
         # P = V diag(p) V' of W J = U diag(s) V', see `compensate`
         U, s, Vt = np.linalg.svd(W @ J, full_matrices=True)
         some = s.shape[1]
@@ -535,20 +564,20 @@ class _Cell(NamedTuple):
         p = np.maximum((e / largest) ** 2 - s**2, 0.0)
         p += NULL_SPACE_WEIGHT * s[:, :1] ** 2 * (s <= 1e-9 * s[:, :1])
         still = STILL * np.eye(n)
-        P = np.einsum("nki,nk,nkj->nij", Vt, p, Vt) + np.where(turning[:, None], 0.0, still)
+        P = np.einsum("nki,nk,nkj->nij", Vt, p, Vt) + (not turning) * still
         lowest, highest = self.robot.limits.T
         inside = np.clip(commands, lowest, highest)
         limits = np.array([np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)])
         corrected, left, active = nearest(self.identified, load, wanted, commands, limits, W, P)
-        first = np.flatnonzero(choice & turning[:, 0] & reached & (self.norms(left)[0] > REACHED))
+        first = np.flatnonzero((choice and turning) & reached & (self.norms(left)[0] > REACHED))
         if len(first):  # the whole pose cannot be had
             there = load[first], wanted[first], commands[first], limits[:, first], counts[first] * FIRST, still[None]
             corrected[first], left[first], active[first] = nearest(self.identified, *there)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        met = self._reached(left * np.where(turning, 1.0, KEPT[:k]), counts)
+        met = self._reached(left if turning else left * KEPT[:k], counts)
         cases = {"ok": met, "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
-        fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status, "turning": turning}
+        fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
         fields |= {"there": pose_before[:, :3], "targets_at": pose_before[:, :3] + (before - missed)[:, :3]}
         fields["position_before"], fields["orientation_before"] = self.norms(before)
         error = self.identified.at(corrected, load, target)[1]
@@ -582,48 +611,56 @@ class _Cell(NamedTuple):
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
         every = np.arange(len(poses))
         n = self.robot.dof
-        low, high = self.robot.limits.T
         turn = np.where(np.array(self.robot.joint_dimensions) == "angle", 2 * np.pi, np.inf)
 
-        def found(rows: np.ndarray, start: Array, W: Array) -> tuple[Array, Array, np.ndarray]:
-            limits = np.maximum(low, start - turn), np.minimum(high, start + turn)
+        def found(rows: np.ndarray, start: Array, W: Array, box: Array) -> tuple[Array, Array, np.ndarray]:
+            limits = np.maximum(box[0], start - turn), np.minimum(box[1], start + turn)
             return nearest(self.nominal, load[rows], poses[rows], start, limits, W, np.zeros((1, n, n)))
 
         all_count = np.eye(len(self.kind.components))[None]
-        starts = self._starts(poses, load.shape[1]) if q is None else q[:, None]
-        best, left, _ = found(every, starts[:, 0], all_count)
-        for k in range(1, starts.shape[1]):
-            again = np.flatnonzero(np.linalg.norm(left, axis=1) > REACHED)
-            if not len(again):
-                break
-            other, error, _ = found(again, starts[again, k], all_count)
-            better = np.linalg.norm(error, axis=1) < np.linalg.norm(left[again], axis=1)
+        limits = self.robot.limits.T
+        trials = [(q, limits)] if q is not None else self._trials(poses, load.shape[1])
+        best, left = trials[0][0].copy(), np.full(len(poses), np.inf)
+        for number, (start, box) in enumerate(trials):
+            missing = left > REACHED
+            if number >= 2 * TRIALS:
+                missing = ~missing & ((best < box[0]) | (best > box[1])).any(axis=1)
+            again = np.flatnonzero(missing)
+            other, error, _ = found(again, start[again], all_count, box)
+            error = np.linalg.norm(error, axis=1)
+            better = error < np.maximum(left[again], REACHED)
             best[again[better]] = other[better]
             left[again[better]] = error[better]
         if poses.shape[1] == 3 or n >= 6:
             return best
-        return found(every, best, attainable(self.nominal.at(best, load, poses)[2]))[0]
+        return found(every, best, attainable(self.nominal.at(best, load, poses)[2]), limits)[0]
 
-    def _starts(self, poses: Array, loads: int) -> Array:
-        """Return configurations that come near every pose (N, 2 TRIALS, dof), the nearest of many.
+    def _trials(self, poses: Array, loads: int) -> list[tuple[Array, Array]]:
+        """Return configurations (N, dof) near every pose, and the box (2, dof) to go on in.
 
-        First those in the measured joint ranges, of the same elbow and wrist, then any within limits, or a turn.
+        First `TRIALS` in the measured joint ranges, with half of what they may be exceeded by: the other half is for
+        the correction; then as many within limits, or a turn; then `MORE` in the ranges, for poses that were reached
+        outside.
         """
         low, high = self.robot.limits.T
         low = np.where(np.isfinite(low), low, np.minimum(high, np.pi) - 2 * np.pi)
         high = np.where(np.isfinite(high), high, low + 2 * np.pi)
-        q = np.vstack([block.q[:, 0] for block in self.problem.data.blocks])
-        starts = []
-        for limits in ((q.min(axis=0), q.max(axis=0)), (low, high)):
-            bank = random_candidates(replace(self.robot, limits=np.column_stack(limits)), BANK)
+        spare = SLACK / 2 * np.ptp(self.ranges, axis=0)
+        measured = np.clip([self.ranges[0] - spare, self.ranges[1] + spare], *self.robot.limits.T)
+        trials = []
+        for box in (measured, np.array([low, high])):
+            bank = random_candidates(replace(self.robot, limits=box.T), BANK)
             reached = self.nominal.at(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
             distance = scipy.spatial.distance.cdist(poses[:, :3], reached[:, :3], "sqeuclidean")
             if poses.shape[1] == 7:
                 distance += 8 * (1 - np.abs(poses[:, 3:] @ reached[:, 3:].T))  # the angle's square, nearly
-            closest = np.argpartition(distance, TRIALS, axis=1)[:, :TRIALS]
+            closest = np.argpartition(distance, TRIALS + MORE, axis=1)[:, : TRIALS + MORE]
             order = np.argsort(np.take_along_axis(distance, closest, axis=1), axis=1)
-            starts.append(bank[np.take_along_axis(closest, order, axis=1)])
-        return np.hstack(starts)
+            starts = bank[np.take_along_axis(closest, order, axis=1)]
+            within = box if box is measured else self.robot.limits.T
+            trials.append([(starts[:, i], within) for i in range(TRIALS + MORE)])
+        inside, anywhere = trials
+        return [*inside[:TRIALS], *anywhere[:TRIALS], *inside[TRIALS:]]
 
     def norms(self, error: Array) -> tuple[Array, Array]:
         """Return the norms of position and orientation errors; NaN where there is no orientation."""
