@@ -766,7 +766,9 @@ NEW = ["new", "made", "--robot", "arm.urdf", "--data", "measured.csv", "--units"
 RESULT = ["results"]
 BAD = {
     "no units": (NEW[:6], ["measured.csv", "columns without a unit (x1, y1", "--units", "mm,deg"]),
-    "half the units": ([*NEW[:6], "--units", "m"], ["columns without a unit (joint_1", "such as deg"]),
+    "half the units": (
+        [*NEW[:6], "--units", "m"], ["columns without a unit (joint_1", "--units deg or --units rad, whichever"]
+    ),
     "unknown unit": ([*NEW[:7], "grad,m"], ["--units", "'grad'", "mrad"]),
     "two units": ([*NEW[:7], "m,mm"], ["--units", "m and mm"]),
     "no such robot": ([*NEW[:3], "ur55", *NEW[4:]], ["'ur55'", "ur5"]),

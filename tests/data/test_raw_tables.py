@@ -397,6 +397,29 @@ def test_no_value_of_a_sheet_is_under_another_header_where_columns_are_empty(
     }  # fmt: skip
 
 
+@pytest.mark.parametrize(("places", "meant"), [("AAABBBCCC", True), ("AAAAAAAAA", True), ("ABCDEFGHA", False)])
+def test_a_station_of_several_poses_is_a_session(tmp_path: Path, places: str, meant: bool) -> None:
+    rows = "".join(f"{place},{i},2,401,5,{i}\n" for i, place in enumerate(places))
+    for head in ("Station", "Aufstellung"):
+        columns = read(write(tmp_path, HEAD.replace("Point", head) + rows)).columns
+        assert list(columns.get("session", ())) == list(places) * meant
+
+
+@pytest.mark.parametrize("targets", [True, False])
+def test_the_pose_that_a_controller_computes_is_a_target_and_no_measurement(tmp_path: Path, targets: bool) -> None:
+    head = ",".join(f"{which}_TCP_pose_{i}" for which in ("target", "actual") for i in range(6))
+    path = write(tmp_path, f"Name,{head}\nP1,0.4,0.5,0.6,0,0,1.5,9,9,9,9,9,9\nP2,0.5,0.5,0.6,0,0,1,9,9,9,9,9,9\n")
+    raw = read_raw(path)
+    if targets:
+        columns = interpret(raw, ARM, pose, ro.data.TableOptions(), targets=True).columns
+        assert columns["x_m"] == ["0.4", "0.5"]
+        assert [float(columns["qz"][i]) for i in (0, 1)] == pytest.approx(np.sin([0.75, 0.5]))
+    else:
+        names = "Name,x_mm,y_mm,z_mm," + head
+        found = read(write(tmp_path, f"{names}\nP1,1,2,3{',1' * 12}\nP2,2,2,3{',1' * 12}\n"))
+        assert set(found.columns) == {"label", "x_mm", "y_mm", "z_mm"}
+
+
 def test_messages_that_ros_prints_into_a_text_are_read_and_xml_is_named(tmp_path: Path) -> None:
     message = "header:\n  seq: {0}\nname: [two, one]\nposition: [{0}.5, 0.25]\nvelocity: []\neffort: []\n---\n"
     found = read(write(tmp_path, message.format(0) + message.format(1), "states.txt"), joints=("one", "two"))

@@ -654,7 +654,7 @@ def test_a_reference_in_both_files_leaves_the_names_of_the_others(monkeypatch, c
         assert new(monkeypatch, arm, tmp_path / f"cell{count}", files, *more) == 0
         said = capsys.readouterr().out
         assert f"{count} rows match, of {COUNT} with joints and {COUNT} measured" in said
-        assert ("same name, ignored: REF" in said) == (count < COUNT)
+        assert ("same name, ignored: REF. To keep them: --key row" in said) == (count < COUNT)
         assert {"P0", f"P{COUNT - 3}"} <= {*ro.load(tmp_path / f"cell{count}").problem.data.label}
 
 

@@ -66,11 +66,12 @@ NAMES: tuple[tuple[str, ...], ...] = (
     (r"anchor(?:_(?:id|name|no|nr))?", "fixture"),
     (r"temp(?:erature|eratur)?", "temperature"),
     (r"session(?:_?(?:id|name|no|nr))?|measurement_session|campaign|messreihe|sitzung", "session"),
+    (r"(?:station|set_?up|aufstellung|standpunkt)(?:_?(?:id|name|no|nr|nummer))?", "station"),
 )  # fmt: skip
 """What else a column may be called, in lower case and with underscores, what it means, and why unless that is usual."""
 IN_SI = {
     r"%?field\..*|/.*|(?:pose|transform)\.\w+\.\w|position\[\d\]": "ROS: SI units (REP 103)",
-    r"(?:actual|target)_q_\d": "Universal Robots' RTDE: SI units",
+    r"(?:actual|target)_(?:q|TCP_pose)_\d": "Universal Robots' RTDE: SI units",
 }
 """Patterns of names whose units are rad and m, and whose they are."""
 KINDS = {
@@ -90,6 +91,11 @@ TURNS = (
     (("o", "a", "t"), ("rx", "ry", "rz"), "Kawasaki: O, A, T", "intrinsic zyz"),
 )
 """Three letters that are angles where all of them are there, and the rotation unless that is roll, pitch, yaw."""
+TCP_POSES = tuple(
+    (tuple(f"{which}_tcp_pose_{i}" for i in range(6)), ("x", "y", "z", "rx", "ry", "rz"),
+     "Universal Robots' RTDE: position and rotation vector of the TCP", "vector") for which in ("target", "actual")
+)  # fmt: skip
+"""The same of poses that a controller computes: targets, no measurements."""
 JOINTS = (
     (("s", "l", "u", "r", "b", "t"), "Yaskawa: S, L, U, R, B, T"),
     (("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3"), "Universal Robots: Base, Shoulder, ..., Wrist 3"),

@@ -15,7 +15,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.layout import RawTable, TableOptions, is_missing
 from rpim_opt.basics.tables import Columns, numbers
 from rpim_opt.basics.text import listed
-from rpim_opt.basics.units import DISPLAY, UNITS, split, split_unit
+from rpim_opt.basics.units import DISPLAY, UNITS, accepted_units, split, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables import names as known_names
 from rpim_opt.data.tables.names import Meaning, Meanings, endings, numbered, quaternion_columns, recognize
@@ -30,6 +30,7 @@ INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
 """In the name of a coordinate that is not the robot's own; actual may be either."""
 CONTROLLER = re.compile(r"\$?pos_act|actual_tcp", re.IGNORECASE)
 """Beginning of coordinates that a controller computes: KUKA's and Universal Robots'."""
+PLACED = 3  # configurations, at least, for each place of an instrument: three points tell it
 REPEATED = 0.2  # share of rows whose label is there again, up to which they are of a reference point
 INCOMPLETE = 0.25  # share of the rows that may lack one of several values, and are left out then
 MEANINGS = {
@@ -166,8 +167,8 @@ def _readings(
     for words, why in known_names.JOINTS:
         if dof == len(words) and stems >= set(words):
             _rename(read, {word: f"q{i}" for i, word in enumerate(words, start=1)}, why)
-    for letters, new, why, turns in known_names.TURNS:
-        if {"x", "y", "z", *letters} <= stems:
+    for letters, new, why, turns in (*known_names.TURNS, *(known_names.TCP_POSES if targets else ())):
+        if stems | {*new} >= COORDINATES and stems >= {*letters}:
             _rename(read, dict(zip(letters, new, strict=True)), why)
             rotation = turns
             break
@@ -193,8 +194,20 @@ def _readings(
             read[name] = Meaning("", "", "a temperature without a unit")
     _leave_out_efforts(read, dof, wanted)
     _leave_out(read, targets)
+    _name_sessions(read, table)
     _choose_label(read, table, options.key)
     return read, rotation
+
+
+def _name_sessions(read: Meanings, table: Columns) -> None:
+    """Take the only column that names the instrument's places for sessions; one a pose is a label, which others are."""
+    places = [name for name, each in read.items() if each.stem == "station" and all(map(str, table[name]))]
+    joints = [table[name] for name, each in read.items() if re.fullmatch(r"q\d+", each.stem)]
+    if len(places) == 1 and "session" not in {each.stem for each in read.values()}:
+        poses = {*zip(*joints, strict=True)} or range(len(table[places[0]]))
+        count = len({*table[places[0]]})
+        if count == 1 or len(poses) >= PLACED * count:
+            read[places[0]] = Meaning("session", "", "where the instrument stood")
 
 
 def counts_rows(keys: Sequence[str]) -> bool:
@@ -426,8 +439,11 @@ def _under_our_names(
         meant.append(Column(name, words_of_column, new, unit, f"{reason}; unit {why}" if why else reason))
     unitless = {each.column: dimensions[each.name][0] for each in meant if dimensions.get(each.name)}
     if unitless:
-        missing = ",".join(DISPLAY.get(dimension, dimension) for dimension in dict.fromkeys(unitless.values()))
-        accepted = f"--units, such as {missing}, or names with a unit, such as q1_deg and x_mm"
+        units_of = [
+            (DISPLAY.get(of, of), next(iter(accepted_units(of)), of)) for of in dict.fromkeys(unitless.values())
+        ]
+        either = " or ".join(dict.fromkeys(f"--units {','.join(each)}" for each in zip(*units_of, strict=True)))
+        accepted = f"{either}, whichever they are in, or names with a unit, such as q1_deg and x_mm"
         raise InputError("the header", f"columns without a unit ({', '.join(unitless)})", accepted)
     if not columns:
         accepted = "names with units, such as q1_deg and x_mm, in the header or as --columns"
