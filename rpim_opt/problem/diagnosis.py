@@ -24,7 +24,7 @@ from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import SHIFTED, CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.registration.points import FAR, Fit, Points, agreeing, fit_points, lengths_of, misfit, points_of
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.mdh import Robot, numbered
 from rpim_opt.robot.parameters import of_session, tool_prefix
 
@@ -897,6 +897,7 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
     }
     cause = "is it loose in its nest, or its holder compliant"
     yield from _changes(whole, there, A, [tool_prefix(m) + c for m in markers for c in "xyz"], "reflector", cause, down)
+    yield from _tilts(whole, A, flange[:, :3, 3])
     for family in (bends, eccentric, bends | eccentric):  # either alone explains more with fewer columns
         lacking = np.isin(free.names, every[family & ~p.identified])
         if lacking.any():
@@ -917,6 +918,27 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
         slow = "the instrument or the base drifted slowly, though the joint values are in no order"
         still = "temperature? Measure reference points between the rows, or all in a shorter time"
         yield Addition((A[:, base, None] * courses[:, None]).reshape(len(A), -1), lambda c: (slow, still))
+
+
+def _tilts(problem: CalibrationProblem, A: Array, flange: Array) -> Iterator[Addition]:
+    """Yield that the base tilts by the side of the flange (N, 3), by its weight, or by the first harmonic of joint 1.
+
+    It tilts about two axes, as a turn about the first joint's own axis is that of an eccentric gear.
+    """
+    p, robot = problem.parameters, problem.robot
+    turns = [p.free.names.index(name) for name in ("base_rx", "base_ry", "base_rz") if name in p.free.names]
+    if len(turns) < 3 or robot.joint_types[0] != "revolute":
+        return
+    base = numeric_frame(p.nominal[[p.names.index(f"base_{c}") for c in FRAME]])[:3, :3]
+    across = numeric_frame([0, 0, 0, robot.mdh[0, 0], 0, 0])[:3, :2]
+    tilts = A[:, turns] / p.free.scale[turns] @ base @ across
+    reach, q1 = flange @ across, problem.joint_values[:, 0]
+    side = reach / np.maximum(np.linalg.norm(reach, axis=1, keepdims=True), TINY)
+    what = "the base tilts with the direction of the arm"
+    remedy = "are its bolts tight, its foot and the bearing of joint 1 stiff? Fix it, and measure again"
+    for share in (side, reach, np.column_stack([np.cos(q1), np.sin(q1)])):
+        columns = tilts[:, :, None] * share[problem.owners, None]
+        yield Addition(columns.reshape(len(A), -1), lambda c: (what, remedy))
 
 
 def _with_others(problem: CalibrationProblem, x: Array, others: np.ndarray) -> tuple[CalibrationProblem, Array]:

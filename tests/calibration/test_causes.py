@@ -362,6 +362,13 @@ def loose_reflector(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
     return values(lambda y: y + (base[:3, :3] @ turn @ slip[:, :, None])[:, :, 0])(problem)
 
 
+def rocking(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Tilt the base by 1 mrad about its x axis, to the side to which joint 1 turns the arm."""
+    base = numeric_frame(problem.parameters.nominal[[problem.parameters.names.index(f"base_{c}") for c in FRAME]])
+    axis = 1e-3 * np.sign(np.sin(problem.data.q[:, :1])) * base[:3, 0]
+    return values(lambda y: y + np.cross(axis, y - base[:3, 3]))(problem)
+
+
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
@@ -370,6 +377,7 @@ def loose_reflector(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
             r"residuals of column y are \d",
         ),
         (loose_reflector, "gravity at the flange the points move to and fro, consistent with a changed reflector"),
+        (rocking, "the base tilts with the direction of the arm"),
         (values(lambda y: np.hstack([(2e3 * y[:, :1]).round() / 2e3, y[:, 1:]])), r"are rounded to 0.5 mm \(x\)"),
         (of_joint(4, tenths), r"are rounded to 0.1 deg \(q5\)"),
         (of_joint(2, lambda q: q + 0.009 * (q > 0.6)), r"from q3 = 3\d(\.\d+)? deg on .* a changed zero of joint 3"),
@@ -383,6 +391,7 @@ def loose_reflector(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
     ids=[
         "noise in a column",
         "a loose nest",
+        "a base that rocks",
         "a rounded column",
         "a rounded joint",
         "a joint that falls back",
