@@ -585,6 +585,9 @@ def compensate(
 ) -> Output:
     """Correct joint commands so that the calibrated robot reaches the poses of the nominal one.
 
+    The commands are columns q1_deg, ... of the table, in degrees (of prismatic joints q1_mm, ... in mm), whatever the
+    units of the targets.
+
     Exit code 1 if the robot is not delivered, or a command misses its target: unreachable, or error and uncertainty
     above the limit (without a limit: error above twice its standard uncertainty).
     """

@@ -310,6 +310,8 @@ def test_a_noise_that_nobody_stated_is_called_assumed(monkeypatch, capsys, made,
     assert run(monkeypatch, "report", str(folder / "results"), "--out", str(tmp_path / "report.html")) == 0
     assert "noise is assumed, not stated" in (tmp_path / "report.html").read_text()
     text = (folder / "problem.toml").read_text()
+    assert "\n# [tolerance]\n" in text  # one that nobody stated is no tolerance
+    assert "+- one standard deviation: known = " in text
     (folder / "problem.toml").write_text(re.sub(r"noise_assumed = true.*\n", "", text))
     capsys.readouterr()
     assert run(monkeypatch, "calibrate", str(folder)) == 0

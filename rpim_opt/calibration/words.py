@@ -69,11 +69,17 @@ def columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
     cells = []
     for row, of_curve in zip(result.parameter_rows(), result.problem.parameters.free.of_curves, strict=True):
         if not of_curve:
-            figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
-            std = "-" if row["std"] is None else f"{row['std']:.4f}"
+            n = decimals(row["std"])
+            figures = [f"{row['nominal']:z.{n}f}", f"{row['identified']:z.{n}f}", f"{row['deviation']:+z.{n}f}"]
+            std = "-" if row["std"] is None else f"{row['std']:.{n}f}"
             name = f"{row['parameter']} *" if rotated(row) else row["parameter"]
             cells.append([name, printed(row["unit"]), *figures, std])
     return ["parameter", "unit", "nominal", "identified", "deviation", "std"], cells
+
+
+def decimals(std: float | None) -> int:
+    """Return how many decimals show two digits of a standard deviation, at least 4 and at most 9."""
+    return 4 if not std or not np.isfinite(std) else int(np.clip(1 - np.floor(np.log10(std)), 4, 9))
 
 
 def curve_columns(result: Outcome) -> tuple[list[str], list[list[str]]]:

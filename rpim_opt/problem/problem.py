@@ -265,6 +265,9 @@ class CalibrationProblem(RobotModel):
         q = np.atleast_2d(np.asarray(q, dtype=float))
         N = len(q)
         turning = [dimension == "angle" for dimension in arm.robot.joint_dimensions]
+        if q.ndim != 2:
+            accepted = f"(N, {len(turning)}), a configuration a row: q[:, 0] of a block, whose q has points, too"
+            raise InputError("q", f"shape {q.shape}", accepted)
         if q.shape[-1] == len(turning) and np.abs(q[:, turning]).max(initial=0.0) > MOST_TURNS * 2 * np.pi:
             found = f"{np.abs(q[:, turning]).max():.6g} rad"
             raise InputError("q", found, f"at most {MOST_TURNS} turns: are these degrees? Use np.radians(q)")

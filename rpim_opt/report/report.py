@@ -16,7 +16,7 @@ from scipy.special import stdtrit
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.files import write_text
-from rpim_opt.basics.text import percent
+from rpim_opt.basics.text import counted, listed, percent
 from rpim_opt.basics.units import joint_columns, printed
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import prior_penalty
@@ -87,6 +87,11 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     if lacking is not None and lacking.alarming:  # said at the top; otherwise it is a diagnosis
         warnings = [" ".join(composition), *warnings]
         composition = []
+    left_out = () if result.learned is None else result.learned.left_out
+    if left_out:
+        warnings.append(
+            f"Excluded outliers: {counted(len(left_out), 'row')}, {listed([str(row) for row in left_out])}."
+        )
     accepted = None if result.record.requirement is None else accept(result)
     workspace = measured_workspace(result) if accepted is None else accepted.workspace
     if workspace is not None and not np.isfinite(workspace.expanded).all():
@@ -284,7 +289,7 @@ def _parameters(content: Content) -> Iterator[Block]:
     bounds = own.rows({"U": half[~free.of_curves], "tolerance": tolerance[~free.of_curves]})
     for (name, unit, *figures, _), bound in zip(words.columns(result)[1], bounds, strict=True):
         edge = ", at its bound" if bound["parameter"] in at_bound else ""
-        expanded = "" if bound["U"] is None else f"±{bound['U']:.4f}"
+        expanded = "" if bound["U"] is None else f"±{bound['U']:.{words.decimals(bound['U'] / 2)}f}"
         allowed = "" if bound["tolerance"] is None else f"±{bound['tolerance']:.4g}"
         rows.append([f"{name} [{printed(unit)}]{edge}", *figures, expanded, allowed][:columns])
     yield "text", words.weight_lines(result)

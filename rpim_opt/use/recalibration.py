@@ -36,7 +36,7 @@ from rpim_opt.problem.multi_robot import identifying_sessions
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import placed, same_place
 from rpim_opt.robot.kinematics import FRAME, frame_numbers
-from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session
+from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session, session_prefix
 from rpim_opt.store.result_file import content
 from rpim_opt.use.sessions import base_frame, registered_again
 
@@ -52,6 +52,7 @@ RIVAL, AS_GOOD = 0.05, 4.0  # probability, or what chi-squared falls less by, up
 SHOWN = 5  # causes that are shown
 BASE = "base_"
 OF_ROBOT = ("robot_serial", "controller")  # details of a record that stay when the robot is measured again
+OF_EARLIER = " (of the earlier calibration)"  # of who measured, with what and when, where the new rows do not say it
 UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "  # What title and source of an updated calibration say.
 
 
@@ -258,6 +259,11 @@ def update(
     say = progress or (lambda step: None)
     problem = with_data(result, data)
     free = problem.parameters.free
+    if any(map(of_session, free.names)) and (wrong := [each for each in reset if each.startswith(BASE)]):
+        own = session_prefix(str(data.session[0]))
+        known = any(name.startswith(own) for name in result.problem.parameters.free.names)
+        accepted = f"'{own}*'" if known else "no --reset: a new session is registered by itself"
+        raise InputError("update, reset", f"'{wrong[0]}', but every session has an offset of its own", accepted)
     released = tuple(np.array(free.names)[matching(free, reset, "update, reset")].tolist()) if reset else ()
     say("comparing with the previous calibration")
     elsewhere = "" if released else _base_elsewhere(result, problem, prior_inflation)
@@ -341,7 +347,10 @@ def _carried_on(record: Record, last: Earlier, source: str) -> Record:
         excluded=dict.fromkeys(last.excluded, "far outside the prediction intervals of the previous calibration"),
         simulated=record.simulated,
         noise_assumed=record.noise_assumed,
-        details={key: record.details[key] for key in OF_ROBOT if key in record.details},
+        details={
+            key: text if key in OF_ROBOT or text.endswith(OF_EARLIER) else text + OF_EARLIER
+            for key, text in record.details.items()
+        },
         requirement=record.requirement,
         earlier=(*record.earlier, last),
         reading=record.reading,

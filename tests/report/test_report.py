@@ -138,6 +138,9 @@ def test_parameters_state_their_flange_frame_and_units_as_they_are_written() -> 
     assert np.allclose([row["deviation"] for row in rows], 1e3 * result.x[bends])
     assert f"{rows[0]['parameter']} [mrad]" in words
     assert "mrad_per_Nm" not in words
+    U = re.search(r"compliance2 \[mrad/\(N m\)\][^±]*±0\.0*(\d+)", words)
+    assert U is not None
+    assert len(U[1]) >= 2  # digits of it, where four decimals had none
     assert words.count("alpha and a in the last row of a DH sheet follow it") == 1
 
 
@@ -405,4 +408,7 @@ def test_outliers_that_were_excluded_automatically_are_in_the_table(tmp_path) ->
     ro.report.write_report(result, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count("excluded outlier, ") == len(result.learned.left_out)
+    first = Reader(page).words.partition("Accuracy and uncertainty")[0]  # who signs reads the first page
+    assert f"Excluded outliers: {len(result.learned.left_out)} rows, " in first
+    assert all(row.label in first for row in result.learned.left_out)
     assert "No row is flagged or excluded" not in page

@@ -145,6 +145,8 @@ def test_what_a_formulation_cannot_do_is_said() -> None:
 def test_a_script_is_told_of_degrees_and_of_arrays_that_are_no_dataset() -> None:
     result, degrees = calibrated(), [[10.0, -90.0, 45.0, 0.0, 30.0, 0.0]]
     for use in (result.forward, result.predict, partial(ro.use.compensate, result)):
+        with pytest.raises(ro.InputError, match=r"q: found shape \(2, 1, 6\), accepted: "):
+            use(np.zeros((2, 1, 6)))
         with pytest.raises(ro.InputError, match=r"q: found 90 rad, accepted: at most 4 turns: are these degrees"):
             use(degrees)
     for use in (result.errors, partial(ro.use.validate, result), result.problem.on):

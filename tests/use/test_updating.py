@@ -295,7 +295,9 @@ def test_a_file_says_what_it_carries_on(tmp_path, crashed: Robot, first) -> None
     details = {"by": "the first operator", "robot_serial": "120-4711"}
     loaded = replace(loaded, record=replace(loaded.record, details=details))
     found = ro.use.update(loaded, crashed.after)
-    assert found.result.record.details == {"robot_serial": "120-4711"}
+    kept = {"by": "the first operator (of the earlier calibration)", "robot_serial": "120-4711"}
+    assert found.result.record.details == kept
+    assert ro.use.update(found.result, crashed.now).result.record.details == kept
     ro.store.save_result(found.result, tmp_path / "second.json")
     second = ro.load_result(tmp_path / "second.json")
     last = second.record.earlier[-1]
