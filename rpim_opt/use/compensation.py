@@ -370,11 +370,9 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
     """Return the fields of all rows, and whether orientations are corrected where nobody says so."""
     starts = range(0, len(targets.label), BLOCK)
     blocks = [Targets._make(None if v is None else v[i : i + BLOCK] for v in targets) for i in starts]
-    aims = on_all_cores(cell.aim, blocks)
     choice = orientation is None and cell.kind is pose
-    vague = 0  # one row that turns alone would turn against the others
-    if choice:
-        vague = sum(on_all_cores(lambda i: cell.vague_orientations(blocks[i], aims[i]), range(len(blocks))))
+    aims = on_all_cores(lambda some: cell.aim(some, choice), blocks)
+    vague = sum(each.vague for each in aims)  # a row that is turned alone would be turned against the others
     parts = on_all_cores(lambda i: cell.corrected(blocks[i], aims[i], largest, not vague, choice), range(len(blocks)))
     fields: dict[str, Any] = {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
     why = " Orientations of all targets are corrected." if choice else ""
@@ -439,6 +437,7 @@ class _Aim(NamedTuple):
     missed: Array  # (N, k) errors that are left
     beside: Array  # (N,) see `Compensation`
     reached: np.ndarray
+    vague: int = 0  # orientations that are known no better than by the nominal robot
 
 
 class _Cell(NamedTuple):
@@ -517,8 +516,8 @@ class _Cell(NamedTuple):
             result.ranges[which],
         )  # fmt: skip
 
-    def aim(self, targets: Targets) -> _Aim:
-        """Return the uncorrected commands of some targets, and what these miss."""
+    def aim(self, targets: Targets, choice: bool) -> _Aim:
+        """Return the uncorrected commands of some targets, what these miss, and of a ``choice`` what is vague."""
         _, q, poses, torque, payload = targets
         N = len(targets.label)
         borne = [] if torque is None else [torque @ np.linalg.inv(self.robot.joint_map)]
@@ -533,14 +532,12 @@ class _Cell(NamedTuple):
             missed = self.nominal.at(commands, load, poses)[1]
             if q is not None:
                 beside = self.norms(self.nominal.at(q, load, poses)[1])[0]
-        counts = attainable(self.identified.at(commands, load, target)[2])
-        return _Aim(commands, target, load, missed, beside, self._reached(missed, counts))
-
-    def vague_orientations(self, targets: Targets, aim: _Aim) -> int:
-        """Return how many orientations that can be reached are known no better than by the nominal robot."""
-        missed = self.norms(self.identified.at(aim.commands, aim.load, aim.target)[1])[1]
-        known = missed >= self.uncertainty(aim.commands, targets)[1]
-        return int(np.count_nonzero(aim.reached & ~known))
+        _, before, J = self.identified.at(commands, load, target)
+        aim = _Aim(commands, target, load, missed, beside, self._reached(missed, attainable(J)))
+        if not choice:
+            return aim
+        known = self.norms(before)[1] >= self.uncertainty(commands, targets)[1]
+        return aim._replace(vague=int(np.count_nonzero(aim.reached & ~known)))
 
     def corrected(self, targets: Targets, aim: _Aim, largest: float, turning: bool, choice: bool) -> dict[str, Array]:
         """Return the fields of a `Compensation` for some targets, with their orientations or, not ``turning``, without.
@@ -548,7 +545,7 @@ class _Cell(NamedTuple):
         Of a ``choice`` positions come first. ``there`` (N, 3) are the positions of uncorrected commands, ``targets_at``
         (N, 3) where the nominal robot has them.
         """
-        commands, target, load, missed, beside, reached = aim
+        commands, target, load, missed, beside, reached, _ = aim
         pose_before, before, J = self.identified.at(commands, load, target)
         N, k, n = J.shape
         counts = np.broadcast_to(attainable(J), (N, k, k))
