@@ -318,13 +318,9 @@ def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
 
 
 def _uncommented(grid: Grid, line: int, width: int, label: str) -> list[str]:
-    """Return a row without the sign that makes it a comment, and as wide as the table if names hold blanks.
-
-    Several names, ``Collection Group Point``, may then stand above a ``label``, ``A::Robot::P1``. Any other separator
-    says which cells stand above each other.
-    """
+    """Return a row without the sign that makes it a comment, and as wide as the table if names hold blanks."""
     cells = list(grid.rows[line])
-    if grid.mark != " ":
+    if grid.mark != " ":  # cells stand above each other
         return [COMMENT.sub("", cells[0]), *cells[1:]]
     if len(cells) > width:
         named = BLANK_NAME.findall(" ".join(cells))
@@ -333,7 +329,7 @@ def _uncommented(grid: Grid, line: int, width: int, label: str) -> list[str]:
         cells[0] = COMMENT.sub("", cells[0])
         if not cells[0] and len(cells) > width:
             cells = cells[1:]
-    excess = len(cells) - width
+    excess = len(cells) - width  # several names, Collection Group Point, may stand above a label, A::Robot::P1
     return ["::".join(cells[: excess + 1]), *cells[excess + 1 :]] if excess == label.count("::") else cells
 
 

@@ -41,7 +41,6 @@ SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": 
 """What may stand between cells, by name; a space stands for any number of them."""
 SAMPLE = 2**15  # characters from which the separator is found
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", ".xyz", ".pts", ".md", ".html", ".htm", ".xls")
-"""Endings of tables as text; instruments and web pages call these .xls, too."""
 EXCEL = (".xlsx", ".xlsm", ".ods")
 EXCEL_97, ZIPPED = b"\xd0\xcf\x11\xe0", b"PK\x03\x04"  # how workbooks begin, old ones and those of today
 BORDERS = str.maketrans("│┃║", "|||")  # lines between the columns of printed tables
@@ -75,15 +74,12 @@ Columns = Mapping[str, Sequence[Any]]
 
 
 class Grid(NamedTuple):
-    """The non-blank rows of a file, their line numbers, notes on reading, and what separates cells.
-
-    Nothing does in a workbook, where a row ends at its last cell that is filled.
-    """
+    """The non-blank rows of a file, their line numbers, notes on reading, and what separates cells."""
 
     rows: list[list[str]]
     lines: list[int]
     notes: tuple[str, ...] = ()
-    mark: str = ""
+    mark: str = ""  # of a workbook, whose rows end at their last cell that is filled
 
 
 # --- tables of problem folders: a header, then rows ----------------------------------------------------------------

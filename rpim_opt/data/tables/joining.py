@@ -169,8 +169,8 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
     counts = f"{len(right)} rows match, of {len(chosen.left)} with joints and {len(chosen.right)} measured"
     notes = [f"joined by {chosen.how}: {counts}."]
     if again:
-        why = f"several rows of {joints.file} have the same name, ignored"
-        notes.append(f"{why}: {listed(list(again))}. To keep them: {OTHER_KEYS}.")
+        names_again = f"{listed(list(again))}. To keep them: {OTHER_KEYS}."
+        notes.append(f"several rows of {joints.file} have the same name, ignored: {names_again}")
     matched, known = set(names), {*place, *again}
     lonely = [name for name in place if name not in matched] + [name for name in chosen.right if name not in known]
     if lonely:

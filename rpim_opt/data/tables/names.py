@@ -91,10 +91,8 @@ TURNS = (
     (("o", "a", "t"), ("rx", "ry", "rz"), "Kawasaki: O, A, T", "intrinsic zyz"),
 )
 """Three letters that are angles where all of them are there, and the rotation unless that is roll, pitch, yaw."""
-TCP_POSES = tuple(
-    (tuple(f"{which}_tcp_pose_{i}" for i in range(6)), ("x", "y", "z", "rx", "ry", "rz"),
-     "Universal Robots' RTDE: position and rotation vector of the TCP", "vector") for which in ("target", "actual")
-)  # fmt: skip
+TCP = (("x", "y", "z", "rx", "ry", "rz"), "Universal Robots' RTDE: position and rotation vector", "vector")
+TCP_POSES = tuple((tuple(f"{which}_tcp_pose_{i}" for i in range(6)), *TCP) for which in ("target", "actual"))
 """The same of poses that a controller computes: targets, no measurements."""
 JOINTS = (
     (("s", "l", "u", "r", "b", "t"), "Yaskawa: S, L, U, R, B, T"),

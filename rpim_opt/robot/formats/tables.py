@@ -52,6 +52,7 @@ ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*�
 ANGLES = tuple(name for name, dimension in MDH_DIMENSION.items() if dimension == "angle")
 TURNS, NEARLY = {np.pi / 2: "pi/2", np.pi: "pi"}, 0.002
 """Angles [rad] of most tables, and what three digits of them miss at most."""
+SIGNS = {"°": "deg", "pi": "rad", "π": "rad"}  # of units in cells
 LARGEST_TURN = 2 * np.pi  # [rad] in a table of a robot's links: larger numbers are degrees
 JOINT_NAME = re.compile(r"(?:joint|axis|link|achse|gelenk)[\s_]*\d+", re.IGNORECASE)  # in a cell
 WITHOUT_COLUMN = {"coupling": "a coupling of joints", "mounting": "a mounting elsewhere", "payload": "a payload"}
@@ -221,9 +222,7 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
         conventions.add("modified")
     known = {CONVENTIONS.get(each, each) for each in conventions}
     if len(known) != 1 or not known <= set(CONVENTIONS.values()):
-        accepted = (
-            "--dh modified (Craig: alpha first), --dh standard (Paul, Hayati: theta first), or column `convention`"
-        )
+        accepted = "--dh modified (Craig, alpha first), --dh standard (Paul, theta first), or column `convention`"
         raise InputError("the convention of the table", " and ".join(sorted(known)) or "not stated", accepted)
     joints = [_joint(dict(zip(columns, cells, strict=True))) for cells in zip(*columns.values(), strict=True)]
     robot = _robot({"name": path.stem, "joint": joints}, path)
@@ -244,11 +243,9 @@ def _sheet_columns(raw: RawTable) -> tuple[dict[str, list[str]], list[str]]:
         unit = unit or raw.units.get(MDH_DIMENSION.get(stem, ""), "")
         if stem in JOINT_NAMES or not any(texts) or all(map(JOINT_NAME.fullmatch, texts)):
             continue
-        if stem in ANGLES and not unit and any("°" in text for text in texts):
-            unit = "deg"
-        elif stem in ANGLES and not unit and any("pi" in text.lower() or "π" in text for text in texts):
-            unit = "rad"
-        elif stem in ANGLES and not unit and len(stated) == 1:
+        if stem in ANGLES and not unit:
+            unit = next((of for sign, of in SIGNS.items() if sign in "".join(texts).lower()), "")
+        if stem in ANGLES and not unit and len(stated) == 1:
             turns = [_joint({f"{stem}_rad": text}).get(f"{stem}_rad") for text in texts]
             degrees = any(isinstance(turn, float | int) and abs(turn) > LARGEST_TURN for turn in turns)
             if not (degrees and "rad" in stated):  # radians in a column of degrees are refused below
