@@ -59,6 +59,7 @@ MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), 
 UNUSUAL = {"length": 0.004, "angle": 0.05}
 """Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
 SCALED = 0.002  # common deviation of the longest link [m] from which a wrong scale is the likelier reason
+MOST_SCALED = 0.3  # common deviation beyond which no scale is off: other units are looked for by themselves
 SIGMAS, COMMON = 3.0, 0.6  # standard deviations of it that chance does not make, and its least part of all deviations
 ALIKE = 0.045  # part of an effect on the data that others may leave where these do not distinguish them
 DEPENDENT = 1e-6  # singular value of effects, over the largest, below which they are combinations of the others
@@ -203,7 +204,7 @@ def _little_motion(result: Outcome) -> Iterator[str]:
 def _like_a_scale(result: Outcome) -> str:
     """Return a sentence if the lengths of a robot deviate in common, as by the scale of what measured them."""
     free, C = result.problem.parameters.free, result.known_covariance
-    if C is None:
+    if C is None or any(_residuals(result, kept_rows(result))):  # of rows that do not fit deviations say nothing
         return ""
     lengths = (np.array(free.dimensions) == "length") & ~free.of_frames & (free.nominal != 0) & np.isfinite(np.diag(C))
     if not lengths.any():
@@ -214,7 +215,7 @@ def _like_a_scale(result: Outcome) -> str:
     information = nominal @ precision @ nominal
     stretch = float(nominal @ precision @ x / information)
     chance = max(SIGMAS**2, COMMON * float(x @ precision @ x))
-    if np.abs(stretch * nominal).max() < SCALED or stretch**2 * information < chance:
+    if np.abs(stretch * nominal).max() < SCALED or abs(stretch) > MOST_SCALED or stretch**2 * information < chance:
         return ""
     what = "an instrument of another scale: check its units and its compensation"
     if scaled_by_board(result):
@@ -507,7 +508,9 @@ def likely_causes(result: Outcome) -> list[str]:
     if known:
         causes, shared = [], [*known, *shared]
     elif signs or not result.converged:
-        causes = _held(result, problem) or _limited_by_formulation(result, problem, kept)
+        # a table that is read wrongly makes no robot; of another one a stated frame may be wrong
+        causes = _other_readings(result, problem, ordered) if any(_deviations(result)) else []
+        causes = causes or _held(result, problem) or _limited_by_formulation(result, problem, kept)
         causes = causes or [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
         ignored = result.record.details.get("ignored_joints")
         if ignored:
@@ -689,20 +692,26 @@ def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
     return [upward_sentence(joints)] if joints else []
 
 
-def _explanations(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> list[str]:
-    """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some."""
+def _other_readings(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> list[str]:
+    """Return what is wrong with single rows, and what explains all or some of them if they are read otherwise."""
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
         return list(diagnosis.rows_without_values(problem.data, problem.arms))
-    kept = kept_rows(result)
-    error = rms(problem.errors(result.x)[kept])
-    beyond = error >= LARGEST["length"]  # what a robot's own effects may be
-    explained = max(ratio for _, ratio in residual_rms(result, kept).values()) < NOTICED
+    explained = max(ratio for _, ratio in residual_rms(result, kept_rows(result)).values()) < NOTICED
     most = REACH * arm_length(problem) if explained else np.inf  # else wrong lengths explain more
-    outside = diagnosis.beyond_limits(problem.robot, diagnosis.all_q(problem.data), OUTSIDE)
-    parts = of_sessions(ordered)
     # beside single rows, which may be the ones where something changed
+    parts = of_sessions(ordered)
+    return first(*(chain(diagnosis.single_rows(part), diagnosis.better_interpretations(part, most)) for part in parts))
+
+
+def _explanations(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> list[str]:
+    """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some."""
+    if len(problem.arms) > 1:
+        return _other_readings(result, problem, ordered)
+    error = rms(problem.errors(result.x)[kept_rows(result)])
+    beyond = error >= LARGEST["length"]  # what a robot's own effects may be
+    outside = diagnosis.beyond_limits(problem.robot, diagnosis.all_q(problem.data), OUTSIDE)
     return first(
-        *(chain(diagnosis.single_rows(part), diagnosis.better_interpretations(part, most)) for part in parts),
+        _other_readings(result, problem, ordered),
         (f"{text}: check the unit and the column of its values." for text in outside),
         _shown_without_outliers(result, ordered),
         diagnosis.rounded(problem, error),

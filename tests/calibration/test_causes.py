@@ -1150,6 +1150,19 @@ def test_a_table_in_another_convention_is_named(by: int, convention: str) -> Non
     assert f"read it with --dh {convention.partition(' ')[0]}: " in causes[1]
 
 
+@pytest.mark.slow
+def test_a_table_in_another_convention_is_named_before_a_beta() -> None:
+    """Its parameters bend into the right arm, by a right angle, and a beta of parallel axes improves that further."""
+    robot, data, rng = read_robot(READY / "ur5e.toml"), simulated_arm("ur5e").data, np.random.default_rng(1)
+    arm = replace(robot, mdh=robot.mdh + 1e-3 * np.array([5, 1, 8, 1, 5]) * rng.normal(size=robot.mdh.shape))
+    y = ro.robot.forward_kinematics(arm, data.q)[:, :3] @ [0.06, -0.03, 0.09, 1.0]
+    noisy = ro.Dataset.of(data.q, y + mistakes.NOISE * rng.normal(size=y.shape), mistakes.NOISE)
+    sheet = replace(robot, mdh=np.hstack([np.roll(robot.mdh[:, :2], -1, axis=0), robot.mdh[:, 2:]]))
+    verdict = ro.calibrate(ro.problem_from(sheet, noisy)).verdict
+    assert "a table in the standard (distal) Denavit-Hartenberg convention" in verdict.reasons[-1]
+    assert not verdict.caution
+
+
 def cable(outliers: bool = False, **changes: np.ndarray) -> ro.Calibration:
     """Calibrate with the lengths of one cable whose anchor is not stated."""
     problem = ro.load("cable").problem
