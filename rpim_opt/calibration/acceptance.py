@@ -365,9 +365,10 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     against += missed
     if least > limit:
         fit = judged(result)
-        if fit is not None and fit.repeated is not None:
-            what, remedy = "the robot's repeatability alone contributes", "only a more repeatable robot reduces it"
-        else:
+        what, remedy = "the robot's repeatability alone contributes", "only a more repeatable robot reduces it"
+        if fit is not None and fit.excess:
+            what, remedy = "an effect that it lacks contributes", str(fit).removesuffix(".")
+        elif fit is None or fit.repeated is None:
             what = "the robot's repeatability, or an effect that the model lacks, contributes"
             remedy = "repeat five configurations, approached from both sides, to separate them, and measure others"
         against.append(f"With this model {what} at least {1e3 * least:.3f} mm: {remedy}.")

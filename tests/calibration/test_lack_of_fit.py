@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.calibration.acceptance import Requirement
 from rpim_opt.calibration.lack_of_fit import FEWEST, LackOfFit, autocorrelation, judged, lack_of_fit
 from rpim_opt.report.report import page
 from tests.simulate import ALL, ARM, simulated
@@ -139,6 +140,18 @@ def test_repeated_readings_tell_repeatability_from_what_comes_again():
     assert bent.repeated == pytest.approx(ROOT3 * NOISE, rel=0.2)
     assert bent.excess > bent.repeated
     assert "is systematic (repeatable)" in str(bent)
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ({"repeatability": 2e-4}, "the robot's repeatability alone contributes at least"),
+        ({"compliance": BENT}, r"an effect that it lacks contributes at least .* Gravity would explain"),
+    ],
+)
+def test_repeatability_rejects_a_robot_where_repeated_readings_show_it(how: dict[str, float], said: str) -> None:
+    found = ro.calibration.accept(learned(7, n=30, repeats=2, **how), Requirement(1e-4))
+    assert re.search(said, found.reasons[0]), found.reasons
 
 
 def test_too_few_equations_are_not_judged():
