@@ -307,7 +307,8 @@ class Dataset(Tabled):
             blocks = whole.by_place(_names(marker, "marker", N, points), _names(fixture, "fixture", N))
         else:
             blocks = (whole,)
-        configuration = _numbered(map(tuple, q.reshape(N, -1).tolist()))
+        _, at, own = np.unique(q.reshape(N, -1), axis=0, return_index=True, return_inverse=True)
+        configuration = np.argsort(np.argsort(at))[own.reshape(-1)]  # in the order of their first rows
         labels = _names(label, "label", N)
         return cls(blocks, tuple(str(i + 1) for i in range(N)) if labels is None else tuple(labels), configuration)
 

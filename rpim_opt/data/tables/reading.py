@@ -86,8 +86,9 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         raise InputError("the header", ", ".join(table), accepted)
     point = texts(table[naming[0]], naming[0]) if naming else ()
     session = texts(table.get("session", ()), "session")
-    first = texts(table.get("marker", ("",) * N), "marker")
-    markers = [first, texts(table.get("to_marker", first), "to_marker")][: kind.points]
+    first = texts(table["marker"], "marker") if "marker" in table else ("",) * N
+    second = texts(table["to_marker"], "to_marker") if "to_marker" in table else first
+    markers = [first, second][: kind.points]
     for i in range(N if kind.points == 2 else 0):
         if markers[0][i] == markers[1][i] and np.array_equal(q[i, 0], q[i, 1]):
             accepted = "to_marker or to_q1, ... of another point; measurement cable for distances to a fixed anchor"
@@ -214,8 +215,11 @@ def values_form(columns: Numbers, kind: Measurement) -> tuple[list[str], Callabl
 
 def labels(table: Columns, N: int) -> tuple[str, ...]:
     """Return the rows' labels, by default numbers from 1; refuse missing and duplicate ones."""
-    label = texts(table.get("label", range(1, N + 1)), "label")
-    require_unique(label, "label")
+    if "label" in table:
+        label = texts(table["label"], "label")
+        require_unique(label, "label")
+    else:
+        label = tuple(map(str, range(1, N + 1)))
     for column in ("marker", "to_marker", "fixture", "configuration", "point", "plane", "session"):
         names = texts(table.get(column, ()), column)
         if "" in names:
