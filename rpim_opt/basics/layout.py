@@ -336,10 +336,9 @@ def _uncommented(grid: Grid, line: int, width: int, label: str) -> list[str]:
 # --- columns and their numbers -------------------------------------------------------------------------------------
 
 
-def _columns(grid: Grid, data: Sequence[int], heads: Sequence[tuple[str, str]], options: TableOptions) -> RawTable:
-    """Return the columns, those of numbers with decimal points; blank cells behind rows may be missing or too many."""
+def _as_wide(grid: Grid, data: Sequence[int], width: int, options: TableOptions) -> list[list[str]]:
+    """Return the rows of data as wide as the header; blank cells behind them may be missing or too many."""
     rows = [grid.rows[i] for i in data]
-    width = len(heads)
     what = "--columns, the names of files without a header" if options.columns else "the header"
     for number, row in enumerate(rows, start=1):
         while len(row) > width and not row[-1]:
@@ -349,6 +348,12 @@ def _columns(grid: Grid, data: Sequence[int], heads: Sequence[tuple[str, str]], 
             hint = "" if len(row) < width else "; decimal commas between commas need quotes"
             raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
         row += [""] * (width - len(row))
+    return rows
+
+
+def _columns(grid: Grid, data: Sequence[int], heads: Sequence[tuple[str, str]], options: TableOptions) -> RawTable:
+    """Return the columns, those of numbers with decimal points."""
+    rows = _as_wide(grid, data, len(heads), options)
     columns: dict[str, list[str]] = {}
     groups: dict[str, str] = {}
     for j, (name, group) in enumerate(heads):

@@ -259,12 +259,7 @@ def update(
     say = progress or (lambda step: None)
     problem = with_data(result, data)
     free = problem.parameters.free
-    if any(map(of_session, free.names)) and (wrong := [each for each in reset if each.startswith(BASE)]):
-        own = session_prefix(str(data.session[0]))
-        known = any(name.startswith(own) for name in result.problem.parameters.free.names)
-        accepted = f"'{own}*'" if known else "no --reset: a new session is registered by itself"
-        raise InputError("update, reset", f"'{wrong[0]}', but every session has an offset of its own", accepted)
-    released = tuple(np.array(free.names)[matching(free, reset, "update, reset")].tolist()) if reset else ()
+    released = _reset(result, data, free, reset)
     say("comparing with the previous calibration")
     elsewhere = "" if released else _base_elsewhere(result, problem, prior_inflation)
     base = tuple(name for name in free.names if name.startswith(registration(free, data)))
@@ -310,6 +305,16 @@ def update(
     unclear = {each.name for each in moved if isinstance(each, Moved) and abs(each.change) < 2 * each.std}
     vague += tuple(cause.name for cause in changes if unclear.issuperset(cause.members))
     return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
+
+
+def _reset(result: Calibration, data: Dataset, free: Parameters, reset: Sequence[str]) -> tuple[str, ...]:
+    """Return the parameters that the earlier result does not describe; refuse the base beside sessions."""
+    if any(map(of_session, free.names)) and (wrong := [each for each in reset if each.startswith(BASE)]):
+        own = session_prefix(str(data.session[0]))
+        known = any(name.startswith(own) for name in result.problem.parameters.free.names)
+        accepted = f"'{own}*'" if known else "no --reset: a new session is registered by itself"
+        raise InputError("update, reset", f"'{wrong[0]}', but every session has an offset of its own", accepted)
+    return tuple(np.array(free.names)[matching(free, reset, "update, reset")].tolist()) if reset else ()
 
 
 def _refuse_another_robot(result: Calibration, updated: Calibration, data: Dataset, base_reset: bool) -> None:
