@@ -248,12 +248,12 @@ def test_figures_of_benchmarks_in_texts_are_the_studys() -> None:
     by_count = {row["count"]: row for row in rows if row["part"] in ("rows", "cluster")}
     each = {count: 1e6 * row["seconds"] / row["passes"] / count for count, row in by_count.items()}
     million = 10**6
-    assert f"A million configurations take {each[million]:.1f} us each and iteration" in STUDIES
+    assert f"A million configurations took {each[million]:.1f} us each and iteration" in STUDIES
     assert f"ten million on a Dask cluster of two processes {each[10 * million]:.1f} us" in STUDIES
     megabytes = {count: row["peak_mb"] for count, row in by_count.items()}
     assert "in the memory of a hundred thousand" in STUDIES
     assert megabytes[million] < 1.1 * megabytes[million // 10]
-    said = f"take {each[million]:.1f} microseconds each and iteration, in {megabytes[million]:.0f} MB"
+    said = f"took {each[million]:.1f} microseconds each and iteration, in {megabytes[million]:.0f} MB"
     assert f"A million configurations {said}" in PAGES["large_data"]
 
 
