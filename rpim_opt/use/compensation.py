@@ -367,7 +367,7 @@ def _less_certain(reflector: _Cell, found: Compensation, targets: Targets) -> st
 
 
 def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool | None) -> tuple[dict[str, Any], str]:
-    """Return the fields of all rows, and whether orientations are corrected where nobody says so."""
+    """Return the fields of all rows, and whether orientations are corrected where that is not stated."""
     starts = range(0, len(targets.label), BLOCK)
     blocks = [Targets._make(None if v is None else v[i : i + BLOCK] for v in targets) for i in starts]
     choice = orientation is None and cell.kind is pose
