@@ -508,10 +508,17 @@ def likely_causes(result: Outcome) -> list[str]:
     if known:
         causes, shared = [], [*known, *shared]
     elif signs or not result.converged:
-        # a table that is read wrongly makes no robot; of another one a stated frame may be wrong
-        causes = _other_readings(result, problem, ordered) if any(_deviations(result)) else []
-        causes = causes or _held(result, problem) or _limited_by_formulation(result, problem, kept)
-        causes = causes or [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
+        explanations = [
+            _held(result, problem),
+            _limited_by_formulation(result, problem, kept),
+            _other_readings(result, problem, ordered),
+        ]
+        if any(_deviations(result)):  # a table that is read wrongly makes no robot; of another one a frame may be wrong
+            explanations.insert(0, explanations.pop())
+        causes = [
+            *first(*explanations, _residual_causes(result, problem, ordered)),
+            *diagnosis.computed_columns(problem),
+        ]
         ignored = result.record.details.get("ignored_joints")
         if ignored:
             state = "state another robot, or a link behind them (--urdf-tip), if these move the tool"
@@ -598,10 +605,10 @@ def _large_deviations(result: Outcome) -> Iterator[str]:
         yield f"{free.names[worst]} deviates by {in_unit(result.x[worst], free.dimensions[worst])}"
 
 
-def _held(result: Outcome, problem: CalibrationProblem) -> list[str]:
+def _held(result: Outcome, problem: CalibrationProblem) -> Iterator[str]:
     """Say which stated frame or joint parameter is wrong and not identified; without curves, which would take it up."""
     if len(problem.arms) > 1:
-        return []
+        return
     p = problem.parameters
     now, own = rms(problem.errors(result.x)), result.x[~p.free.of_curves]
     problem = problem.identifying(p.identified & ~p.of_curves)
@@ -617,15 +624,14 @@ def _held(result: Outcome, problem: CalibrationProblem) -> list[str]:
         then = rms(freed.errors(ridge_deviations(freed)))
         if then < best:
             best, said = then, group
-    if not said:
-        return []
-    return [
-        f"the stated {said.removesuffix('_*')} is wrong, and not identified: with `{said}` in `identify` residuals are "
-        f"{three_digits(1e3 * best)} mm instead of {three_digits(1e3 * now)} mm (RMS)."
-    ]
+    if said:
+        yield (
+            f"the stated {said.removesuffix('_*')} is wrong, and not identified: with `{said}` in `identify` residuals "
+            f"are {three_digits(1e3 * best)} mm instead of {three_digits(1e3 * now)} mm (RMS)."
+        )
 
 
-def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: np.ndarray) -> list[str]:
+def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: np.ndarray) -> Iterator[str]:
     """Say that loss, penalty or constraints leave what a squared penalty at weight 1 explains of the same rows."""
     if kept.mean() < 1 - EXCLUDED:  # downweighted by a fit that is wrong everywhere
         kept = np.ones_like(kept)
@@ -635,23 +641,24 @@ def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: 
         rows = rows.without(outliers)
     plain = _worst_ratio(rows, ridge_deviations(rows))
     if not 0 < plain <= NOISY:
-        return []
+        return
     away = sorted(set(problem.labels).difference(rows.labels))
     if away and by_place(result.formulation, problem.groups):
-        return [f"outliers bias a loss that depends on the order of its equations: leave out {listed(away)}."]
+        yield f"outliers bias a loss that depends on the order of its equations: leave out {listed(away)}."
+        return
     if away and not result.squared_loss:
         x = rows.parameters.free.scale * pose(result.formulation, rows.linearize(x)).solve(result.weight).z
     before, now = (_worst_ratio(rows, each) for each in (result.x, x))
     if now < max(NOTICED * plain, before / NOISY):  # outliers limited it
-        return []
+        return
     names = [name_of(constraint, k) for k, constraint in enumerate(result.formulation.constraints)]
     beside = f" without outliers ({listed(away)})" if away else ""
     remedy = f"Loosen its constraints ({joined(names)}) or use" if names else "Use"
-    return [
+    yield (
         f"{LIMITED}: residuals{beside} are {three_digits(now)} times the measurement "
         f"noise, but {three_digits(plain)} times with a squared penalty at weight 1 and no constraint. {remedy} a "
         "smaller weight."
-    ]
+    )
 
 
 def _other_robot(result: Outcome, problem: CalibrationProblem) -> Better | None:
@@ -692,26 +699,28 @@ def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
     return [upward_sentence(joints)] if joints else []
 
 
-def _other_readings(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> list[str]:
-    """Return what is wrong with single rows, and what explains all or some of them if they are read otherwise."""
+def _other_readings(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> Iterator[str]:
+    """Say what is wrong with single rows, and what explains all or some of them if they are read otherwise."""
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
-        return list(diagnosis.rows_without_values(problem.data, problem.arms))
+        yield from diagnosis.rows_without_values(problem.data, problem.arms)
+        return
     explained = max(ratio for _, ratio in residual_rms(result, kept_rows(result)).values()) < NOTICED
     most = REACH * arm_length(problem) if explained else np.inf  # else wrong lengths explain more
     # beside single rows, which may be the ones where something changed
     parts = of_sessions(ordered)
-    return first(*(chain(diagnosis.single_rows(part), diagnosis.better_interpretations(part, most)) for part in parts))
+    yield from first(
+        *(chain(diagnosis.single_rows(part), diagnosis.better_interpretations(part, most)) for part in parts)
+    )
 
 
-def _explanations(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> list[str]:
-    """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some."""
+def _residual_causes(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> Iterator[str]:
+    """Say what explains the residuals of a calibration that is judged bad: something of all rows, else of some."""
     if len(problem.arms) > 1:
-        return _other_readings(result, problem, ordered)
+        return
     error = rms(problem.errors(result.x)[kept_rows(result)])
     beyond = error >= LARGEST["length"]  # what a robot's own effects may be
     outside = diagnosis.beyond_limits(problem.robot, diagnosis.all_q(problem.data), OUTSIDE)
-    return first(
-        _other_readings(result, problem, ordered),
+    yield from first(
         (f"{text}: check the unit and the column of its values." for text in outside),
         _shown_without_outliers(result, ordered),
         diagnosis.rounded(problem, error),
