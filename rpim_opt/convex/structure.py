@@ -311,9 +311,7 @@ class Structure:
         """Return loss and penalty at numbers; minimized over the functions' own variables."""
         if not self.inner:
             return self.loss_of(r), self.penalty_of(z)
-        a, v, form = self.expressions, self.argument(r), self.loss
-        if form is not None and form.threshold is not None and not (self.joint or a.owned(a.penalty_of_z)):
-            return form.best(v)[0], self.penalty_of(z)
+        a, v = self.expressions, self.argument(r)
         with self._lock:
             problem, parameters = self._over_own
             for parameter, number in zip(parameters, (z, v, weight if self.joint else 1.0), strict=True):

@@ -172,7 +172,7 @@ def test_an_active_set_is_followed_where_some_rows_are_left_out() -> None:
     assert np.count_nonzero(iterations) <= 4  # of 40
 
 
-def test_row_generation_ends_where_the_other_rows_do_not_matter() -> None:
+def test_a_threshold_of_a_users_own_is_the_mean_of_the_largest_at_its_minimum() -> None:
     count = 1_500
 
     def cvar(r):

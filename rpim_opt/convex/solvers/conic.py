@@ -183,11 +183,6 @@ class Canonical:
         cones = [clarabel.ZeroConeT(self.zero), clarabel.NonnegativeConeT(self.linear - self.zero)]
         return [cone for cone, count in zip(cones, (self.zero, self.linear - self.zero), strict=True) if count]
 
-    def set_slope(self, variable: Any, slope: float) -> None:
-        """Set the slope of a scalar variable in the objective."""
-        column = self._columns[variable.id]
-        self.q[column] = slope * self.column_scale[column]
-
     def value(self, x: Array) -> float:
         """Return the objective at x (N,)."""
         return float(0.5 * x @ (self.P @ x) + self.q @ x) + self.offset

@@ -8,7 +8,6 @@ and Saunders 2014, SIAM J. Optim. 24:1420).
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -48,11 +47,8 @@ POOR = 1e-3
 """Ratio of pivots of a Hessian below which it gets secants (iteratively reweighted least squares) beside it."""
 FEWER, LEAST_SECANTS = 0.1, 1e-8
 """Factor on the secants after a full step, and their least part."""
-DECADES, TANGENTS, EXACT = 6, 100, 1e-15
-"""Decades beyond the largest entry in which a best threshold is looked for, by how many tangents at most, and how
-exactly, relative."""
 SCALED = ("AddExpression", "multiply", "MulExpression", "DivExpression", "reshape", "Promote")
-"""Expressions below which a maximum is looked for."""
+"""Expressions of which entry i depends on entry i of their arguments."""
 JUMP = 1e-3
 """Part of the slope's total variation above which a jump counts."""
 PROBES = 64
@@ -360,7 +356,7 @@ def gram(A: Array, weights: Array) -> Array:
 class Loss:
     """A loss f(v) that is not quadratic, of residuals v (M,), or where ``positive`` of configurations' norms.
 
-    Where it is ``separable``, f(v) = sum_i f_i(v_i); with a ``threshold`` t min_t rate t + sum_i f_i(v_i, t). It has
+    Where it is ``separable``, f(v) = sum_i f_i(v_i), where it is the ``largest`` entry, f(v) = max_i f_i(v_i). It has
     ``shared`` own variables with penalty or constraints.
     """
 
@@ -368,22 +364,15 @@ class Loss:
         self.expression, self.variable, self.positive, self.shared = expression, variable, positive, shared
         self.piecewise_quadratic = bool(expression.is_qpwa())
         self.entries: Any = None
-        self.threshold: Any = None
-        self._lock = threading.Lock()  # a variable has one value at a time
-        expression = _by_threshold(expression)
-        own = [v for v in expression.variables() if v.id != variable.id]
-        if not own:
-            self.entries = _summands(expression, variable)
-        elif len(own) == 1 and own[0].shape == () and not (shared or any(own[0].attributes.values())):
-            self.entries, self.threshold = _summands(expression, variable), own[0]
-            self.rate = self._rate(expression)
-            if not np.isfinite(self.rate):
-                self.entries = self.threshold = None
+        self.largest = type(expression).__name__ == "max"
+        if {v.id for v in expression.variables()} == {variable.id}:
+            whole = expression.args[0] if self.largest else None
+            self.entries = _summands(expression, variable) if whole is None else _checked(whole, variable)
 
     @property
     def separable(self) -> bool:
         """Whether the loss is a sum over entries."""
-        return self.entries is not None and self.threshold is None
+        return self.entries is not None and not self.largest
 
     @cached_property
     def canonical(self) -> Canonical:
@@ -412,71 +401,11 @@ class Loss:
         high, low = self.slope(v + apart), self.slope(v - apart)
         return self.slope(v), np.maximum((high - low) / (2 * apart), 0.0)
 
-    # --- with a threshold ---
-
-    def _rate(self, expression: Any) -> float:
-        """Return what the threshold costs a unit beside the entries; NaN where that varies, or entries are curved."""
-        if self.entries is None or not self.entries.is_pwl():  # of curved entries tangents bound too little
-            return np.nan
-        self.variable.save_value(np.zeros(self.variable.size))
-        beside = []
-        for t in (0.0, 1.0, 3.0):
-            self.threshold.save_value(np.array(t))
-            values: list[Any] = [expression.value, self.entries.value]
-            if values[0] is None or values[1] is None:
-                return np.nan
-            beside.append(float(values[0]) - float(np.sum(values[1])))
-        constant, one, three = beside
-        proportional = constant == 0 and abs(three - 3 * one) <= 1e-12 * abs(three)
-        return one if proportional else np.nan
-
-    def at_threshold(self, t: float) -> Evaluation:
-        """Return functions for f_i(v_i, t) and its slope by v_i at numbers v (M,)."""
-        with self._lock:
-            self.threshold.save_value(np.array(t))
-            return evaluation(self.entries, self.variable)
-
-    def by_threshold(self, v: Array) -> Evaluation:
-        """Return functions for f_i(v_i, t) and its slope by t at a number t."""
-        with self._lock:
-            self.variable.save_value(v)
-            return evaluation(self.entries, self.threshold)
-
-    def best(self, v: Array) -> tuple[float, float]:
-        """Return the least value at v (M,) and the threshold there; infinity where there is none.
-
-        The value is convex and piecewise linear in the threshold: where tangents from both sides meet it has its
-        minimum, or the next tangent.
-        """
-        entries: Any = self.by_threshold(v)
-
-        def at(t: float) -> tuple[float, float, float]:
-            values, slopes = entries(t)
-            return t, self.rate * t + float(np.sum(values)), self.rate + float(np.sum(slopes))
-
-        for far in (1.0 + np.abs(v).max()) * 10.0 ** np.arange(DECADES):
-            low, high = at(-far), at(far)
-            if low[2] <= 0 <= high[2]:
-                break
-        else:
-            return np.inf, np.nan
-        for k in range(TANGENTS):
-            if low[2] == 0 or high[2] == 0:
-                break
-            t = low[0] + (high[1] - low[1] - high[2] * (high[0] - low[0])) / (low[2] - high[2])
-            bound = low[1] + low[2] * (t - low[0])
-            middle = at(0.5 * (low[0] + high[0]) if k % 3 == 2 else t)
-            low, high = (middle, high) if middle[2] < 0 else (low, middle)
-            if middle[1] <= bound + EXACT * max(abs(bound), abs(middle[0])):
-                break
-        t, value, _ = min(low, high, key=lambda point: point[1])
-        return value, t
-
     def some(self, which: np.ndarray) -> Canonical:
-        """Return the sum of some entries (k,) and the threshold in canonical form."""
+        """Return the sum of some entries (k,), or the largest of them, in canonical form."""
         own = cp.Variable(len(which))
-        total = cp.sum(_restricted(self.entries, self.variable, own, which))
-        return Canonical(total if self.threshold is None else total + self.threshold, [], own)
+        entries = _restricted(self.entries, self.variable, own, which)
+        return Canonical(cp.max(entries) if self.largest else cp.sum(entries), [], own)
 
     def slope_jump(self, rows: Rows) -> float:
         """Return the largest jump of the slope by residuals of usual size, or where norms are zero; 0 for none."""
@@ -507,16 +436,6 @@ class Loss:
 
 
 # --- the expression tree -----------------------------------------------------------------------------------------
-
-
-def _by_threshold(e: Any) -> Any:
-    """Return an expression whose maximum or sum of the k largest is written as min_t k t + sum(pos(v - t))."""
-    if type(e).__name__ in ("max", "sum_largest") and e.size == 1:
-        t = cp.Variable()
-        return getattr(e, "k", 1) * t + cp.sum(cp.pos(e.args[0] - t))
-    if type(e).__name__ in SCALED:
-        return e.copy([_by_threshold(a) for a in e.args])
-    return e
 
 
 def _summands(e: Any, v: Any) -> Any:
@@ -567,8 +486,6 @@ def _restricted(e: Any, v: Any, own: Any, which: np.ndarray) -> Any:
     """Return the entries (k,) of an entrywise expression, as an expression of their own variable (k,)."""
     if e is v:
         return own
-    if not e.args and e.variables():  # a threshold
-        return e
     if not e.variables():
         if e.size == v.size and e.size > 1:
             return cp.Constant(np.ravel(e.value)[which])

@@ -3,34 +3,23 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.expressions import OutsideDomain
-from rpim_opt.convex.solvers.conic import (
-    EQUILIBRATED,
-    Canonical,
-    Damping,
-    Point,
-    ReducedProgram,
-    ReducedSquares,
-    Unsolved,
-)
-from rpim_opt.convex.solvers.separable import FEW_ENTRIES, TINY, Loss, Newton, Rows
+from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, ReducedProgram, ReducedSquares, Unsolved
+from rpim_opt.convex.solvers.separable import FEW_ENTRIES, Loss, Newton, Rows
 
 if TYPE_CHECKING:
     from rpim_opt.convex.structure import Structure
 
 GENERATIONS = 40
 """Working sets of entries before all rows are taken."""
-INACTIVE = 1e-6
-"""Part of the largest slope below which slopes are the same, and an entry of a loss is not active."""
 GAP = 1e-8
-"""Relative gap between a loss and its bound by tangents at which the working set suffices."""
+"""By how much an entry may be above the largest one of the working set, relative."""
 
 
 @dataclass(eq=False)
@@ -41,7 +30,6 @@ class WarmStart:
     z: Array | None = None
     x: Array | None = None
     width: float = 0.0
-    count: int = 0
     part: tuple[np.ndarray, ReducedProgram] | None = None
     small: dict[Any, ReducedProgram] = field(default_factory=dict)
     jump: float = -1.0
@@ -64,7 +52,7 @@ class WarmStart:
         """Discard all solvers, and start the next solution from z (n,)."""
         with self.lock:
             self.z = self.x = z if len(self.canonical.at) == self.canonical.size else None
-            self.width, self.count, self.part, self.small = 0.0, 0, None, {}
+            self.width, self.part, self.small = 0.0, None, {}
         return self
 
 
@@ -76,7 +64,7 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
     separable, few entries       all rows in Clarabel, where that is quicker
     separable, smooth            proximal Newton, a sequence of small programs
     separable, non-smooth        the same on the smoothed loss, then rows where it bends
-    with a threshold             entries near a non-smooth point as they are, tangents of others
+    a largest entry              those entries that are the largest on the way
     any other                    all rows in Clarabel
     ============================ ===================================================
 
@@ -92,7 +80,7 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
         if loss is None:
             point = warm.program(rows.A.shape[1] + 1).solve(rows.squares.damped(damping), weight)
         elif not loss.separable:
-            point = _coupled(loss, rows, warm, weight, damping)
+            point = _by_largest(loss, rows, warm, weight, damping)
         else:
             try:
                 point = _by_newton(loss, rows, warm, weight, damping)
@@ -145,80 +133,32 @@ def _all_rows(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: D
     return whole.solve(terms, weight, rows.A, rows.b)
 
 
-def _coupled(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
-    """Return the minimum of a loss with a threshold (a maximum, CVaR, the sum of the largest) by some of its entries.
+def _by_largest(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
+    """Return the minimum of a largest entry (minimax) by a working set; of other losses all rows are taken.
 
-    Those near a non-smooth point are taken as they are and all others by their tangents, which bounds the loss from
-    below; those that then have other slopes are added until the bound is reached. Of any other loss all rows are taken.
+    The largest of some entries bounds that of all from below; those that are above it then are added.
     """
     n, at = rows.A.shape[1], warm.canonical.at
-    if loss.variable.size <= FEW_ENTRIES or loss.threshold is None:
+    if loss.variable.size <= FEW_ENTRIES or loss.entries is None:
         return _all_rows(loss, rows, warm, weight, damping)
     terms = _alone(n, damping)
+    working, small = warm.part or (np.zeros(0, dtype=int), None)
     z = warm.z
     if z is None:
         z = warm.program(n + 1).solve(rows.squares.damped(damping), weight).x[at]
-    tangent = Tangent(loss, rows, rows.A @ z - rows.b)
-    if not np.isfinite(tangent.value):
-        return _all_rows(loss, rows, warm, weight, damping)
-    working, small = warm.part or (None, None)
-    if working is None:
-        working = np.sort(tangent.near[: max(4 * n, warm.count or np.count_nonzero(tangent.pull))])
-    for generation in range(GENERATIONS):
-        outside = np.ones(loss.variable.size, dtype=bool)
-        outside[working] = False
-        slope = np.where(rows.by_equation(outside), tangent.slope, 0.0)
+    values = loss.values(rows.entries(rows.A @ z - rows.b))
+    for _ in range(GENERATIONS):
         if small is None or small.rows != len(terms.y):
+            working = np.union1d(working, np.argsort(-values)[: 4 * n])
             small = rows.program(loss, working, warm.canonical, len(terms.y))
-            small.data.clarabel.attempts = (EQUILIBRATED,)
-        part: Any = small.loss
-        part.set_slope(loss.threshold, loss.rate + float(tangent.by_threshold[outside].sum()))
         try:
-            point = small.solve(replace(terms, g=terms.g + rows.A.T @ slope), weight, *rows.equations(working))
-        except Unsolved:
-            if len(working) == len(outside):
-                raise
-            working, small = np.union1d(working, tangent.near[: 4 * len(working)]), None  # bounded too little
-            continue
-        r = rows.A @ point.x[at] - rows.b
-        bound = part.value(point.rest) + float(slope @ r) + float(tangent.constant[outside].sum())
-        there = Tangent(loss, rows, r)
-        if there.value - bound <= GAP * max(abs(bound), 1.0):
-            warm.count = len(working) // 2
-            warm.part = None if generation else (working, small)
-            return point
-        other = np.flatnonzero(np.abs(there.pull - tangent.pull) > INACTIVE * np.abs(there.pull).max())
-        more = np.union1d(working, np.union1d(other, there.near[: 4 * n]))
-        if len(more) == len(working):
+            point = small.solve(terms, weight, *rows.equations(working))
+        except Unsolved:  # some entries alone may be unbounded
             break
-        tangent, working, small = there, more, None
+        values = loss.values(rows.entries(rows.A @ point.x[at] - rows.b))
+        most = values[working].max()
+        if values.max() - most <= GAP * max(abs(most), 1.0):
+            warm.part = working, small
+            return point
+        small = None
     return _all_rows(loss, rows, warm, weight, damping)
-
-
-class Tangent:
-    """The value of a loss with a threshold at a residual (m,), and tangents of its entries there, (N,) each.
-
-    ``pull`` are slopes by the entries and ``slope`` (m,) by the equations.
-    """
-
-    def __init__(self, loss: Loss, rows: Rows, r: Array):
-        self.v, one = rows.entries(r), np.ones(loss.variable.size)
-        self.value, t = loss.best(self.v)
-        self._entries, self._positive = loss.at_threshold(t), loss.positive
-        values, pull = self._entries(self.v)
-        by_threshold: Any = loss.by_threshold(self.v)
-        self.pull, self.by_threshold = one * pull, one * by_threshold(t)[1]
-        self.constant = values - pull * self.v - self.by_threshold * t
-        self.slope = self.pull
-        if loss.positive:
-            self.slope = rows.by_equation(self.pull / np.maximum(self.v, TINY)) * r
-
-    @cached_property
-    def near(self) -> np.ndarray:
-        """The entries (N,) in the order of their distance from a non-smooth point."""
-        far = np.full(len(self.v), np.inf)
-        for h in np.abs(self.v).max() * np.geomspace(2, 1e-8, 20):
-            low = np.maximum(self.v - h, 0.0) if self._positive else self.v - h
-            curved = np.abs(self._entries(self.v + h)[1] - self._entries(low)[1]) * np.ones(len(far))
-            far[curved > INACTIVE * curved.max(initial=0.0)] = h
-        return np.argsort(far, kind="stable")
