@@ -160,29 +160,19 @@ class _Reader:
         return Sentence("move", limit=limit, unit=self.unit, places=places)
 
     def combination(self) -> Sentence:
-        known = self._sum()
-        self._checked(known)
-        patterns = [name for name in known.names if not _PARAMETER.fullmatch(name)]
+        words = [word for _, word in self._tokens]
+        if "+-" not in words:
+            raise self._wrong("no standard deviation")
+        known = self.sentence()
+        patterns = [name for name in known.sums[0].names if not _PARAMETER.fullmatch(name)]
         if patterns:
             raise self._wrong(f"'{patterns[0]}'", "names of single parameters")
-        if known.constant or known.nominal:
-            raise self._wrong("a number or nominal before =", "a sum of parameters, with its value after =")
-        right = self._sum() if self._next("=") else Sum(nominal=1)
-        spread = self._next("+-")
-        wide = self._item(self._next("+", "-")) if spread else Sum()
-        self._require_end()
-        for name in (*right.names, *wide.names):
-            accepted = f"a number with a unit: {choices(name, units())}"
-            raise self._wrong(f"'{name}' where a number is expected", accepted)
-        if not spread:
-            raise self._wrong("no standard deviation")
-        if not self.unit:
-            raise self._wrong("no unit", f"one of {', '.join(units())} at the end")
-        sd = self._constant(wide)
-        if not sd >= SMALLEST:
-            found = f"a standard deviation of {sd / UNITS[self.unit].si:g} {self.unit}"
+        if known.sums[0].constant and "=" not in words:
+            raise self._wrong("a number without =", "a sum of parameters, with its value after =")
+        if not known.limit >= SMALLEST:
+            found = f"a standard deviation of {known.limit:g} m or rad"
             raise self._wrong(found, "a positive standard deviation; [constraints] fixes parameters")
-        return Sentence("within", (known.plus(right, -1),), sd, self.unit)
+        return known
 
     def sentence(self) -> Sentence:
         sides = [self._side()]
@@ -190,7 +180,7 @@ class _Reader:
         while relation := self._next("=", "<=", ">="):
             relations.append(relation)
             sides.append(self._side())
-        tolerance = self._constant(self._sum()) if self._next("+-") else None
+        tolerance = self._constant(self._item(self._next("+", "-"))) if self._next("+-") else None
         self._require_end()
         if not relations and tolerance is not None:  # 'd5 +- 0.1 mm'
             relations, sides = ["="], [*sides, ("", (Sum(nominal=1),))]
