@@ -7,8 +7,7 @@ robust loss keeps.
 CVXPY canonicalizes penalty and constraints once for a `Structure` (`canonical`), a loss once where Clarabel takes all
 of its rows (`Loss.canonical`), and some entries of a nonsmooth loss anew for every working set (`Loss.some`); besides,
 a quadratic of a user's is recognized by a canonical form, and the last resort (`Program.solve`) is canonicalized anew.
-Programs keep their structure, and `MOST_KEPT` of ready formulations are kept for the next ones, then all are
-forgotten. Warm starts and Clarabel's solvers live as long as the programs that `Program.on` makes of one another.
+Structures, warm starts and Clarabel's solvers live as long as the programs that `Program.on` makes of one another.
 """
 
 from __future__ import annotations
@@ -361,36 +360,17 @@ class Structure:
 def structure(
     formulation: Formulation, model: LinearModel, forms: Sequence[Quadratic | None] | None = None
 ) -> Structure:
-    """Return the structure of a formulation for the shape of a model; that of a ready one may be there already."""
+    """Return the structure of a formulation for the shape of a model; arguments as for `pose`."""
     m, n = model.A.shape
-    if not formulation.solvable:
-        return Structure(formulation, model.parameters, m, model.members[0], forms)
-    by_length = formulation.loss in INVARIANT and formulation.loss_over == "equation"
-    if model.stands_for is not None and not by_length:
-        raise InputError(
-            f"formulation '{formulation.name}'",
-            "equations in blocks, of which only the QR factor is kept",
-            "cp.sum_squares or cp.norm2 of the equations as the loss",
-        )
-    if by_length:
-        m = n + 1
-    p, groups = model.parameters, model.members[0]
-    if not formulation.ready:  # its functions may return another thing at every call
-        return Structure(formulation, p, m, groups)
-    key: tuple[Any, ...] = (formulation, n, m, groups.tobytes() if formulation.loss_over == "configuration" else b"")
-    if formulation.constraints or formulation.penalty_over is not None:  # which see the parameters
-        key = (*key, p.names, p.dimensions, p.nominal.tobytes(), p.scale.tobytes(), p.tolerance.tobytes())
-    found = _KEPT.get(key)  # another thread may clear them
-    if found is None:
-        if len(_KEPT) >= MOST_KEPT:
-            _KEPT.clear()
-        found = _KEPT[key] = Structure(formulation, p, m, groups)
-    return found
-
-
-_KEPT: dict[Any, Structure] = {}
-MOST_KEPT = 64
-"""Structures of ready formulations that are kept for the next model of their shape."""
+    if formulation.solvable:
+        by_length = formulation.loss in INVARIANT and formulation.loss_over == "equation"
+        if model.stands_for is not None and not by_length:
+            found = "equations in blocks, of which only the QR factor is kept"
+            accepted = "cp.sum_squares or cp.norm2 of the equations as the loss"
+            raise InputError(f"formulation '{formulation.name}'", found, accepted)
+        if by_length:
+            m = n + 1
+    return Structure(formulation, model.parameters, m, model.members[0], forms)
 
 
 def in_blocks(formulation: Formulation) -> tuple[Formulation, QuadraticModel | None]:

@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex.structure import MOST_KEPT
 from tests.simulate import simulated
 
 WARM = 200
 """Calibrations until what is kept on purpose (a bounded number of compiled programs) is full."""
-COUNT = WARM + int(os.environ.get("LONG_RUN", str(13 * MOST_KEPT)))
-"""Then as many as fill it a whole number of times: all are forgotten at once."""
+COUNT = WARM + int(os.environ.get("LONG_RUN", "800"))
 
 
 def calibrated(i: int) -> None:
