@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -14,11 +14,11 @@ import scipy
 from rpim_opt.basics.arrays import Array, finite_numbers, rms, statistics
 from rpim_opt.basics.exceptions import InputError, RowError, choices, pick
 from rpim_opt.basics.tables import columns_csv, records
-from rpim_opt.basics.text import joined, listed, table
+from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.threads import on_all_cores, one_blas_thread
 from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.calibration.acceptance import accept
-from rpim_opt.calibration.covariance import FitCovariance, noise_covariances, position_noise
+from rpim_opt.calibration.covariance import noise_covariances, position_noise
 from rpim_opt.calibration.diagnosis import SLACK, Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
@@ -171,12 +171,10 @@ class Compensation:
         return [self.label[i] for i in np.flatnonzero(far)]
 
     def _left(self, row: int) -> str:
-        """Return the error of a row, its U where that counts, and the joints at a limit where it misses its target."""
+        """Return the error of a row, its U where that counts, and the joints at a limit."""
         error = f"error {1e3 * self.position_error[row]:.3f} mm"
         error += f", U {1e3 * EXPANDED * self.std[row]:.3f} mm" if self.status[row] == ABOVE else ""
         error += f", {1e3 * self.orientation_error[row]:.3f} mrad" if self.orientation_error[row] > REACHED else ""
-        if self.status[row] != "limited" and self.position_error[row] <= REACHED:
-            return error
         low, high = self.robot.limits.T
         for i in np.flatnonzero((self.q[row] <= low) | (self.q[row] >= high)):
             unit, si = display(self.robot.joint_dimensions[i])
@@ -309,7 +307,7 @@ def compensate(
     if payload_centre is not None:
         arm = replace(arm, gravity=arm.gravity.carrying(arm.gravity.payload, list(payload_centre)))
     kind = pose if oriented else position
-    cell = _Cell.of(result, robot, arm, kind, tool, marker, base, targets.torque is not None)
+    cell = _Cell(result, robot, arm, kind, tool, marker, base, targets.torque is not None)
     if "payload" in cell.loads.stated:
         mass = np.asarray(arm.gravity.payload if payload is None else payload, dtype=float)
         count = len(targets.label)
@@ -343,7 +341,7 @@ def compensate(
     )  # fmt: skip
     if tool is None:
         return found
-    reflector = _Cell.of(result, robot, arm, kind, None, cell.marker, base, targets.torque is not None)
+    reflector = _Cell(result, robot, arm, kind, None, cell.marker, base, targets.torque is not None)
     return replace(found, point=point + _less_certain(reflector, found, targets))
 
 
@@ -354,16 +352,12 @@ def _less_certain(reflector: _Cell, found: Compensation, targets: Targets) -> st
     known, of_tool = reflector.uncertainty(found.q[row : row + 1], there)[0][0], found.std[row]
     if not of_tool > LESS_KNOWN * known:
         return ""
-    dof = reflector.robot.dof
-    last = {f"{name}{dof}" for name in ("d", "theta")} & set(reflector.problem.parameters.free.names)
-    advice = "Measure a reflector as far from the flange as this point."
-    if last:
-        advice = (
-            f"No number of reflectors separates {joined(sorted(last))} from the tool: state what is known of the "
-            "flange (`known` in [prior]), or do not identify these parameters."
-        )
     of_tool, known = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known))
-    return f" In row {found.label[row]}, U is {of_tool} at the tool and {known} at the reflector. {advice}"
+    return (
+        f" In row {found.label[row]}, U is {of_tool} at the tool and {known} at the reflector. Measure a reflector as "
+        "far from the flange as this point, and state what is known of the flange (`known` in [prior]), which the data "
+        "do not separate from the tool."
+    )
 
 
 def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool | None) -> tuple[dict[str, Any], str]:
@@ -371,9 +365,11 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
     starts = range(0, len(targets.label), BLOCK)
     blocks = [Targets._make(None if v is None else v[i : i + BLOCK] for v in targets) for i in starts]
     choice = orientation is None and cell.kind is pose
-    aims = on_all_cores(lambda some: cell.aim(some, choice), blocks)
-    vague = sum(each.vague for each in aims)  # a row that is turned alone would be turned against the others
-    parts = on_all_cores(lambda i: cell.corrected(blocks[i], aims[i], largest, not vague, choice), range(len(blocks)))
+    aims = on_all_cores(cell.aim, blocks)
+    every = range(len(blocks))
+    # a row that is turned alone would be turned against the others
+    vague = sum(on_all_cores(lambda i: cell.vague(blocks[i], aims[i]), every)) if choice else 0
+    parts = on_all_cores(lambda i: cell.corrected(blocks[i], aims[i], largest, not vague, choice), every)
     fields: dict[str, Any] = {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
     why = " Orientations of all targets are corrected." if choice else ""
     if vague:
@@ -400,7 +396,7 @@ def turns_measured(problem: CalibrationProblem) -> bool:
 
 def tool_uncertainty(result: Calibration, q: Array, tool: Array | None, marker: str, robot: str) -> tuple[Array, Array]:
     """Return ``std`` and ``orientation_std`` of a `Compensation` (N,) at commands q (N, dof)."""
-    cell = _Cell.of(result, robot, result.problem.arms[robot], pose, tool, marker, False, False)
+    cell = _Cell(result, robot, result.problem.arms[robot], pose, tool, marker, False, False)
     return cell.uncertainty(q, Targets((), q, None, None))
 
 
@@ -427,40 +423,18 @@ def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
 
 # --- the controller's robot beside the identified one ------------------------------------------------------
 
-
-class _Aim(NamedTuple):
-    """What the nominal controller commands for N targets, and whether it reaches them."""
-
-    commands: Array  # (N, dof)
-    target: Array  # (N, c)
-    load: Array  # (N, l)
-    missed: Array  # (N, k) errors that are left
-    beside: Array  # (N,) see `Compensation`
-    reached: np.ndarray
-    vague: int = 0  # orientations that are known no better than by the nominal robot
+Aim = tuple[Array, Array, Array, Array, Array]
+"""Of N targets: commands (N, dof) of the nominal controller, poses (N, c), loads (N, l), their errors (N, k), `beside`."""
 
 
-class _Cell(NamedTuple):
-    """The controller's robot, the identified one, and the uncertainty of where that is."""
+class _Cell:
+    """The controller's robot, the identified one, and the uncertainty of where that is.
 
-    robot: Robot
-    kind: Measurement
-    nominal: Arm
-    identified: Arm
-    loads: Loads
-    problem: CalibrationProblem  # with the robot's data
-    x: Array  # deviations (n,) of its identified parameters
-    own: np.ndarray  # (n,) their places among all identified ones
-    fit_covariance: FitCovariance | None  # what is known of these
-    marker: str
-    noise: Array  # covariance (k, k) [SI] of a reading
-    level: float  # the noise's variance over that
-    point: str  # sentence on the point that is moved
-    ranges: Array  # (2, dof) measured joint ranges, those of earlier calibrations included
+    Both are functions of joint values, loads and targets (`pose_function`).
+    """
 
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         result: Calibration,
         which: str,
         robot: Robot,
@@ -469,7 +443,7 @@ class _Cell(NamedTuple):
         marker: str,
         base: bool,
         torques: bool,
-    ) -> _Cell:
+    ) -> None:
         """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
         whole = result.problem.parameters
         p = whole.of_robot(which)
@@ -486,15 +460,16 @@ class _Cell(NamedTuple):
         prefix = tool_prefix(marker)
         at = p.frame(prefix)
         place = p.values(x)[at] if tool is None else finite_numbers("tool", tool, (6,))
-        point = f"Target point: the stated tool, at {placed(place)} in the flange frame."
+        self.point = f"Target point: the stated tool, at {placed(place)} in the flange frame."
         if tool is None:
             how = "as identified, " if p.identified[at].any() else ""
-            point = f"Target point: the reflector, {how}at {placed(place)} in the flange frame"
-            point += "; for the controller's TCP state --tool."
+            self.point = f"Target point: the reflector, {how}at {placed(place)} in the flange frame"
+            self.point += "; for the controller's TCP state --tool."
         p = replace(p, nominal=p.nominal.copy(), identified=p.identified.copy())
         p.nominal[at], x[at] = place, 0.0
         p.identified[at] &= tool is None
-        own = whole.free.places_of(which)[p.identified[whole.identified[whole.places_of(which)]]]
+        # places (n,) of the robot's identified parameters among all of them
+        self.own = whole.free.places_of(which)[p.identified[whole.identified[whole.places_of(which)]]]
         values = p.values(x)
         nominal, identified = (dict(zip(p.names, of.tolist(), strict=True)) for of in (p.nominal, values))
         stated = numeric_frame(p.nominal[p.frame("base_")])
@@ -504,20 +479,21 @@ class _Cell(NamedTuple):
         if repeatability is not None and tool is not None:
             repeatability = replace(repeatability, at=values)
         session = result.problem.session
-        problem = CalibrationProblem(robot, p, measured.data, repeatability=repeatability, session=session)
-        noise = np.eye(len(kind.components)) * NO_NOISE
-        noise[:3, :3] += position_noise(measured)
-        require_same_torques(robot, p, measured_torques(problem.data), torques)
-        loads = loads_on(robot, p, problem.data, torques)
-        return cls(
-            robot, kind, Arm.of(robot, nominal, nominal, prefix, np.eye(4), kind, loads),
-            Arm.of(robot, identified, nominal, prefix, moved, kind, loads), loads, problem, x[p.identified],
-            own, None if result.no_intervals else result.fit_covariance, marker, noise, result.variance_factor, point,
-            result.ranges[which],
-        )  # fmt: skip
+        self.robot, self.kind, self.marker = robot, kind, marker
+        self.problem = CalibrationProblem(robot, p, measured.data, repeatability=repeatability, session=session)
+        self.x = x[p.identified]
+        self.fit_covariance = None if result.no_intervals else result.fit_covariance
+        self.noise = np.eye(len(kind.components)) * NO_NOISE  # of a reading
+        self.noise[:3, :3] += position_noise(measured)
+        self.level = result.variance_factor
+        self.ranges = result.ranges[which]
+        require_same_torques(robot, p, measured_torques(measured.data), torques)
+        self.loads = loads_on(robot, p, measured.data, torques)
+        self.nominal = pose_function(robot, nominal, nominal, prefix, np.eye(4), kind, self.loads)
+        self.identified = pose_function(robot, identified, nominal, prefix, moved, kind, self.loads)
 
-    def aim(self, targets: Targets, choice: bool) -> _Aim:
-        """Return the uncorrected commands of some targets, what these miss, and of a ``choice`` what is vague."""
+    def aim(self, targets: Targets) -> Aim:
+        """Return the uncorrected commands of some targets, and what these miss."""
         _, q, poses, torque, payload = targets
         N = len(targets.label)
         borne = [] if torque is None else [torque @ np.linalg.inv(self.robot.joint_map)]
@@ -525,30 +501,31 @@ class _Cell(NamedTuple):
         beside = np.full(N, np.nan)
         if poses is None:
             commands = np.asarray(q)
-            target, error, _ = self.nominal.at(commands, load, np.zeros((N, len(self.kind.columns))))
-            missed = np.zeros_like(error)
-        else:
-            commands, target = self._commands(poses, q, load), poses
-            missed = self.nominal.at(commands, load, poses)[1]
-            if q is not None:
-                beside = self.norms(self.nominal.at(q, load, poses)[1])[0]
-        _, before, J = self.identified.at(commands, load, target)
-        aim = _Aim(commands, target, load, missed, beside, self._reached(missed, attainable(J)))
-        if not choice:
-            return aim
-        known = self.norms(before)[1] >= self.uncertainty(commands, targets)[1]
-        return aim._replace(vague=int(np.count_nonzero(aim.reached & ~known)))
+            target, error, _ = self.nominal(commands, load, np.zeros((N, len(self.kind.columns))))
+            return commands, target, load, np.zeros_like(error), beside
+        commands = self._commands(poses, q, load)
+        if q is not None:
+            beside = norms(self.nominal(q, load, poses)[1])[0]
+        return commands, poses, load, self.nominal(commands, load, poses)[1], beside
 
-    def corrected(self, targets: Targets, aim: _Aim, largest: float, turning: bool, choice: bool) -> dict[str, Array]:
+    def vague(self, targets: Targets, aim: Aim) -> int:
+        """Return how many targets' orientations are known no better than by the nominal robot."""
+        commands, target, load, missed, _ = aim
+        _, before, J = self.identified(commands, load, target)
+        known = norms(before)[1] >= self.uncertainty(commands, targets)[1]
+        return int(np.count_nonzero(is_reached(missed, attainable(J)) & ~known))
+
+    def corrected(self, targets: Targets, aim: Aim, largest: float, turning: bool, choice: bool) -> dict[str, Array]:
         """Return the fields of a `Compensation` for some targets, with their orientations or, not ``turning``, without.
 
         Of a ``choice`` positions come first. ``there`` (N, 3) are the positions of uncorrected commands, ``targets_at``
         (N, 3) where the nominal robot has them.
         """
-        commands, target, load, missed, beside, reached, _ = aim
-        pose_before, before, J = self.identified.at(commands, load, target)
+        commands, target, load, missed, beside = aim
+        pose_before, before, J = self.identified(commands, load, target)
         N, k, n = J.shape
         counts = np.broadcast_to(attainable(J), (N, k, k))
+        reached = is_reached(missed, counts)
         wanted = np.where(turning | (np.arange(target.shape[1]) < 3), target, pose_before)
         due = np.where(reached[:, None] & (turning | (np.arange(k) < 3)), before - missed, 0.0)
         W = counts if turning else counts * FIRST[:k]
@@ -566,19 +543,19 @@ class _Cell(NamedTuple):
         inside = np.clip(commands, lowest, highest)
         limits = np.array([np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)])
         corrected, left, active = nearest(self.identified, load, wanted, commands, limits, W, P)
-        first = np.flatnonzero((choice and turning) & reached & (self.norms(left)[0] > REACHED))
+        first = np.flatnonzero((choice and turning) & reached & (norms(left)[0] > REACHED))
         if len(first):  # the whole pose cannot be had
             there = load[first], wanted[first], commands[first], limits[:, first], counts[first] * FIRST, still[None]
             corrected[first], left[first], active[first] = nearest(self.identified, *there)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        met = self._reached(left if turning else left * KEPT[:k], counts)
+        met = is_reached(left if turning else left * KEPT[:k], counts)
         cases = {"ok": met, "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
         fields |= {"there": pose_before[:, :3], "targets_at": pose_before[:, :3] + (before - missed)[:, :3]}
-        fields["position_before"], fields["orientation_before"] = self.norms(before)
-        error = self.identified.at(corrected, load, target)[1]
-        fields["position_error"], fields["orientation_error"] = self.norms(error)
+        fields["position_before"], fields["orientation_before"] = norms(before)
+        error = self.identified(corrected, load, target)[1]
+        fields["position_error"], fields["orientation_error"] = norms(error)
         fields["std"], fields["orientation_std"] = self.uncertainty(corrected, targets)
         return fields
 
@@ -589,7 +566,7 @@ class _Cell(NamedTuple):
         """
         N, k = len(q), len(self.kind.components)
         if self.fit_covariance is None:
-            return self.norms(np.full((N, k), np.inf))
+            return norms(np.full((N, k), np.inf))
         loads = targets.torque, targets.payload
         problem = self.problem.measuring(q, self.kind, self.marker, *loads, covariance=self.noise)
         J = np.zeros((N, k, len(self.fit_covariance.z)))
@@ -602,11 +579,10 @@ class _Cell(NamedTuple):
         position_and_turn = (self.fit_covariance.of_positions(J[:, i : i + 3]) for i in range(0, k, 3))
         variance = np.hstack([np.einsum("nkk->nk", C) for C in position_and_turn])
         variance += np.einsum("nkk->nk", noise_covariances(problem, self.level).robot[0])
-        return self.norms(np.sqrt(variance))
+        return norms(np.sqrt(variance))
 
     def _commands(self, poses: Array, q: Array | None, load: Array) -> Array:
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
-        every = np.arange(len(poses))
         n = self.robot.dof
         turn = np.where(np.array(self.robot.joint_dimensions) == "angle", 2 * np.pi, np.inf)
 
@@ -630,7 +606,7 @@ class _Cell(NamedTuple):
             left[again[better]] = error[better]
         if poses.shape[1] == 3 or n >= 6:
             return best
-        return found(every, best, attainable(self.nominal.at(best, load, poses)[2]), limits)[0]
+        return found(np.arange(len(poses)), best, attainable(self.nominal(best, load, poses)[2]), limits)[0]
 
     def _trials(self, poses: Array, loads: int) -> list[tuple[Array, Array]]:
         """Return configurations (N, dof) near every pose, and the box (2, dof) to go on in.
@@ -647,7 +623,7 @@ class _Cell(NamedTuple):
         trials = []
         for box in (measured, np.array([low, high])):
             bank = random_candidates(replace(self.robot, limits=box.T), BANK)
-            reached = self.nominal.at(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
+            reached = self.nominal(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
             distance = scipy.spatial.distance.cdist(poses[:, :3], reached[:, :3], "sqeuclidean")
             if poses.shape[1] == 7:
                 distance += 8 * (1 - np.abs(poses[:, 3:] @ reached[:, 3:].T))  # the angle's square, nearly
@@ -659,62 +635,63 @@ class _Cell(NamedTuple):
         inside, anywhere = trials
         return [*inside[:TRIALS], *anywhere[:TRIALS], *inside[TRIALS:]]
 
-    def norms(self, error: Array) -> tuple[Array, Array]:
-        """Return the norms of position and orientation errors; NaN where there is no orientation."""
-        lengths = np.array([dimension == "length" for dimension in self.kind.components.values()])
-        angle = np.full(len(error), np.nan) if lengths.all() else np.linalg.norm(error[:, ~lengths], axis=1)
-        return np.linalg.norm(error[:, lengths], axis=1), angle
 
-    def _reached(self, error: Array, W: Array) -> np.ndarray:
-        distance, angle = self.norms(times(W, error))
-        return (distance <= REACHED) & ~(angle > REACHED)
+def norms(error: Array) -> tuple[Array, Array]:
+    """Return the norms of position and orientation errors (N, 3 or 6); NaN where there is no orientation."""
+    angle = np.linalg.norm(error[:, 3:], axis=1) if error.shape[1] > 3 else np.full(len(error), np.nan)
+    return np.linalg.norm(error[:, :3], axis=1), angle
+
+
+def is_reached(error: Array, W: Array) -> np.ndarray:
+    """Return where no more than `REACHED` is left of errors that are attainable (`attainable`)."""
+    distance, angle = norms(times(W, error))
+    return (distance <= REACHED) & ~(angle > REACHED)
 
 
 # --- inverse kinematics within joint limits, many rows at once ---------------------------------------------
 
+PoseFunction = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
-class Arm(NamedTuple):
-    """A robot with all its parameters known."""
 
-    function: ca.Function  # of model joint values, loads (`Loads`) and target, side by side: pose, its error, and J'
-    joint_map: Array
+def pose_function(
+    robot: Robot,
+    values: Mapping[str, float],
+    nominal: Mapping[str, float],
+    tool: str,
+    before: Array,
+    kind: Measurement,
+    loads: Loads,
+) -> PoseFunction:
+    """Return the function of joint values q (N, dof), loads and targets y (N, c) of a robot with these values.
 
-    @classmethod
-    def of(
-        cls,
-        robot: Robot,
-        values: Mapping[str, float],
-        nominal: Mapping[str, float],
-        tool: str,
-        before: Array,
-        kind: Measurement,
-        loads: Loads,
-    ) -> Arm:
-        """Build the function from parameter values by name; gravity acts on the nominal ones."""
-        command = loads.symbols(len(robot.joint_types), 1)
-        y = ca.SX.sym("y", len(kind.columns))
+    It returns the pose (N, c), its error (N, k) from y, and the Jacobian (N, k, dof) of the pose. Gravity acts on the
+    ``nominal`` values.
+    """
+    command = loads.symbols(len(robot.joint_types), 1)
+    y = ca.SX.sym("y", len(kind.columns))
 
-        def value(name: str) -> float:
-            return values.get(name, 0.0)
+    def value(name: str) -> float:
+        return values.get(name, 0.0)
 
-        configuration = loads.configuration(robot.joint_types, nominal.__getitem__, command)
-        flange = chain(robot.joint_types, configuration, value, robot.model.terms)
-        T = product([ca.SX(ca.DM(before)), *flange, *kinematics.placed([value(tool + c) for c in FRAME])])
-        # how point and orientation of T move with the joints; gravity bends a joint by the values of all of them
-        turn = sum(ca.skew(T[:3, k]) @ ca.jacobian(T[:3, k], command["q"]) for k in range(3)) / 2
-        J = ca.vertcat(ca.jacobian(T[:3, 3], command["q"]), turn)[: len(kind.components), :]
-        modelled = kind.model(T)
-        outputs = [ca.densify(v) for v in (modelled, kind.minus(y, modelled), J.T)]
-        return cls(ca.Function("arm", [ca.vertcat(*command.values(), y)], outputs), robot.joint_map)
+    configuration = loads.configuration(robot.joint_types, nominal.__getitem__, command)
+    flange = chain(robot.joint_types, configuration, value, robot.model.terms)
+    T = product([ca.SX(ca.DM(before)), *flange, *kinematics.placed([value(tool + c) for c in FRAME])])
+    # how point and orientation of T move with the joints; gravity bends a joint by the values of all of them
+    turn = sum(ca.skew(T[:3, k]) @ ca.jacobian(T[:3, k], command["q"]) for k in range(3)) / 2
+    J = ca.vertcat(ca.jacobian(T[:3, 3], command["q"]), turn)[: len(kind.components), :]
+    modelled = kind.model(T)
+    outputs = [ca.densify(v) for v in (modelled, kind.minus(y, modelled), J.T)]
+    function = ca.Function("arm", [ca.vertcat(*command.values(), y)], outputs)
 
-    def at(self, q: Array, load: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Return the pose (N, c), its error (N, k) from y, and the Jacobian (N, k, dof) of the pose."""
-        modelled, error, J = call_rows(self.function, [], np.hstack([q @ self.joint_map.T, load, y]))
-        return modelled[:, 0], error[:, 0], J @ self.joint_map
+    def at(q: Array, load: Array, y: Array) -> tuple[Array, Array, Array]:
+        modelled, error, J = call_rows(function, [], np.hstack([q @ robot.joint_map.T, load, y]))
+        return modelled[:, 0], error[:, 0], J @ robot.joint_map
+
+    return at
 
 
 def nearest(
-    arm: Arm, load: Array, y: Array, start: Array, limits: tuple[Array, Array] | Array, W: Array, P: Array
+    at: PoseFunction, load: Array, y: Array, start: Array, limits: tuple[Array, Array] | Array, W: Array, P: Array
 ) -> tuple[Array, Array, np.ndarray]:
     """Minimize |W error|^2 + D' P D over low <= q <= high, q = start + D, row by row.
 
@@ -732,7 +709,7 @@ def nearest(
     def state(rows: np.ndarray, D: Array) -> tuple[Array, Array, Array, Array]:
         """Return errors, weighted errors, their slopes, and the objectives."""
         q = np.clip(start[rows] + D, low[rows], high[rows])
-        _, error, J = arm.at(q, load[rows], y[rows])
+        _, error, J = at(q, load[rows], y[rows])
         weighted = times(W[rows], error)
         value = np.sum(weighted**2, axis=1) + np.sum(D * times(P[rows], D), axis=1)
         return error, weighted, W[rows] @ J, value
