@@ -52,7 +52,7 @@ def test_numbers_units_and_the_base_are_checked_before_a_folder_is_made(
     assert "--units m does not apply: the header has 'Z [mm]' in mm." in capsys.readouterr().out
     file.write_text("\n".join([names.format(""), *table]))
     assert run(monkeypatch, *arguments, "--units", "deg,m") == 0
-    assert "implausibly far away: are the units right?" in capsys.readouterr().out
+    assert "mm: are the units right?" in capsys.readouterr().out
     file.write_text("\n".join([names.format(" [um]"), *table]))
     assert run(monkeypatch, *arguments[:1], str(tmp_path / "small"), *arguments[2:], "--dry-run") == 0
     assert "mm RMS, those of the nominal flange by" in capsys.readouterr().out

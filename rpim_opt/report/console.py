@@ -154,9 +154,10 @@ def listed_numbers(text: str) -> list[str | int | float]:
     """Return the words of ``learned,1.0``, those that are numbers as numbers."""
 
     def value(word: str) -> str | int | float:
-        for kind in (int, float):
-            with suppress(ValueError):
-                return kind(word)
-        return word
+        try:
+            number = float(word)
+        except ValueError:
+            return word
+        return int(number) if number.is_integer() else number
 
     return [value(word) for word in listed_words(text)]

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from rpim_opt.basics.arrays import Array, statistics
-from rpim_opt.basics.exceptions import InputError, NoSolutionFound
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import counted, listed, percent
 from rpim_opt.basics.units import joint_columns, printed
@@ -87,11 +87,9 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     if lacking is not None and lacking.alarming:  # said at the top; otherwise it is a diagnosis
         warnings = [" ".join(composition), *warnings]
         composition = []
-    left_out = () if result.learned is None else result.learned.left_out
+    left_out = [] if result.learned is None else [str(row) for row in result.learned.left_out]
     if left_out:
-        warnings.append(
-            f"Excluded outliers: {counted(len(left_out), 'row')}, {listed([str(row) for row in left_out])}."
-        )
+        warnings.append(f"Excluded outliers: {counted(len(left_out), 'row')}, {listed(left_out)}.")
     accepted = None if result.record.requirement is None else accept(result)
     workspace = measured_workspace(result) if accepted is None else accepted.workspace
     if workspace is not None and not np.isfinite(workspace.expanded).all():
@@ -323,9 +321,8 @@ def _parameters(content: Content) -> Iterator[Block]:
     drawn = []
     for each in curves:
         draw = partial(plot.transmission_error, each, factor, largest)
-        caption = (
-            f"{str(each).capitalize()}: {1e3 * each.rms:.3f} mrad RMS, {mm(1e3 * each.effect)} mm RMS at the tool."
-        )
+        sizes = f"{1e3 * each.rms:.3f} mrad RMS, {mm(1e3 * each.effect)} mm RMS at the tool"
+        caption = f"{str(each).capitalize()}: {sizes}."
         drawn.append(figure(draw, f"Transmission error of {each}", caption, 200.0))
     yield "figures", drawn
 
@@ -364,11 +361,8 @@ def _diagnostics(content: Content) -> Iterator[Block]:
         yield "text", ["No row is flagged or excluded (by chance, one in a hundred good data sets has a flagged row)."]
     yield "heading", "Convergence"
     c = result.certificate
-    text = (
-        f"Certificate at the solution: next step of the convex program {c.step:.2g}, constraint "
-        f"violation {c.violation:.2g} (in prior standard deviations)."
-    )
-    yield "text", [result.message, text]
+    at_solution = f"next step of the convex program {c.step:.2g}, constraint violation {c.violation:.2g}"
+    yield "text", [result.message, f"Certificate at the solution: {at_solution} (in prior standard deviations)."]
 
 
 def _identifiability(result: Calibration) -> Iterator[Block]:
@@ -457,7 +451,7 @@ def _formulation(result: Calibration) -> str:
 
 
 def _regularization(content: Content) -> Iterator[Block]:
-    """Yield the L-curve, and the choice of every rule with the resulting mean error."""
+    """Yield the L-curve, and the choice of every rule."""
     result = content.result
     formulation = result.formulation
     # with an earlier result as the prior, weight 1 joins two sets of data: no other weight has a meaning
@@ -468,26 +462,14 @@ def _regularization(content: Content) -> Iterator[Block]:
     chosen = {**select.compare(result.program), result.selector: result.selection or by_user}
     chosen = dict(sorted(chosen.items(), key=lambda item: item[1].weight))
     title = "L-curve: residual norm against norm of the deviations"
-    caption = (
-        "Each point is the solution at one weight, from small weights at the upper left to large ones at "
-        "the lower right."
-    )
+    caption = "Each point is the solution at one weight: small ones at the upper left, large ones at the lower right."
     yield "figures", [figure(partial(plot.l_curve, result), title, caption, L_CURVE_HEIGHT)]
-    name, data = next(iter(summary.sets(result).items()))
-    problem = result.problem.on(data)
     rows = []
     for rule, choice in chosen.items():
-        mean = ""
-        with contextlib.suppress(NoSolutionFound):
-            if choice.weight > 0:
-                (estimate,) = result.program.path([choice.weight])
-                errors = problem.errors(result.problem.parameters.free.scale * estimate.z)
-                mean = mm(1e3 * float(np.nanmean(errors)))
         own = f"{rule} (chosen)" if rule == result.selector else rule
-        rows.append([own, f"{choice.weight:.3g}", mean, choice.note or WHY.get(rule, "given")])
-    title = "Weights chosen by the selection rules from the identification data alone. Mean errors are those of the "
-    title += "linearized program: large where a small weight leads beyond the linearization"
-    yield "table", Table(title, ["selector", "weight", f"mean error, {name} [mm]", "criterion"], rows, prose=True)
+        rows.append([own, f"{choice.weight:.3g}", choice.note or WHY.get(rule, "given")])
+    title = "Weights chosen by the selection rules from the identification data alone"
+    yield "table", Table(title, ["selector", "weight", "criterion"], rows, prose=True)
 
 
 SECTIONS = (

@@ -137,11 +137,8 @@ def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None
             f"from all {len(result.problem.labels)}."
         )
         excluded = excluded_by_fit(result)
-        if excluded and np.isfinite(held.error).any():
-            sentence += (
-                f" Not counted: held-out rows {listed(excluded)}, excluded from the fit to all rows; with all "
-                f"of them the mean error is {mm(1e3 * float(np.nanmean(held.error)))} mm."
-            )
+        if excluded:
+            sentence += f" Not counted: held-out rows {listed(excluded)}, excluded from the fit to all rows."
     if result.record.earlier:
         last = result.record.earlier[-1]
         sentence += f" The prior is a calibration of {last.rows} rows; changed since then: {last.changed}."

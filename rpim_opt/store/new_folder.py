@@ -49,10 +49,8 @@ SHARED = (
     'Chains share their common joints. State other shared parameters as `shared` in problem.toml: ["base_*"] where '
     'one instrument measured several chains from one link; by chain as { left = ["base_*"], ... }.'
 )
-EXPORTED = re.compile(rb"calibrated (\d{4}-\d\d-\d\d, digest \w+)")  # in the notes of an exported file
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
-FARTHEST = 50.0  # distance from the instrument to a base beyond which the units are likely wrong [m]
 UNLIKE = 5.0  # ratio of the spreads of measured points and of the nominal flange from which on units are likely wrong
 UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above which they are the same mounting.
 
@@ -185,13 +183,6 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Interpretation, rows:
             "noise beyond it is taken for the robot's repeatability."
         )
     yield from (f"{source.name}, {note}" for note in arm.notes)
-    exported = EXPORTED.search(files.read_bytes(source))
-    if exported:
-        yield (
-            f"{source.name} was exported from a calibration ({exported[1].decode()}). It does not state what that one "
-            "left undetermined, and its uncertainty would be too small: recalibrate with that result as prior "
-            "(rpim-opt update RESULTS TABLE), or begin with the robot's original file."
-        )
     there = "the flange's origin"
     if placed(arm.tool) != placed(np.zeros(6)):  # of a URDF, or a DH table in another convention than the modified one
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"
@@ -415,8 +406,6 @@ def _base(arm: RobotSetup, rows: Dataset, tools: Mapping[str, Array], kind: Meas
     if same_place(located, arm.base):
         offset = 1e3 * np.linalg.norm(located[:3] - arm.base[:3])
         return arm.base, f"Guessed: the data are in the robot's base frame, {offset:.1f} mm from the registered one."
-    if np.linalg.norm(located[:3]) > FARTHEST:
-        verdict = "implausibly far away: are the units right?"
     how = f"Guessed: the base was registered at {placed(located)}, {kind.words.frame} ({verdict})."
     down = -numeric_frame(located)[2, :3]
     if down @ arm.robot.gravity.direction < UPRIGHT and not kind.by_camera:

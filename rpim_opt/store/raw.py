@@ -14,7 +14,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.layout import RawTable, TableOptions
 from rpim_opt.basics.tables import EXCEL, Columns, Grid, read_columns
-from rpim_opt.basics.units import UNITS, split
+from rpim_opt.basics.units import split
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.distance import cable, distance
 from rpim_opt.data.measurements.measurement import Measurement
@@ -109,13 +109,7 @@ def rows_of(
         column = own.get(ours, ours)
         where = f"{row}{mark}'{column}'" if column != ours else error.where
         of_column = [table.file for table in read.tables if column in {each.column for each in table.meant}]
-        accepted = error.accepted
-        units = {name: split(name)[1] for name in read.left_out}
-        lengths = [name for name, unit in units.items() if unit and UNITS[unit].dimension == "length"]
-        lacking = any(error.found.startswith(f"no column for '{stem}'") for stem in kind.columns)
-        if lacking and len(lengths) == 1 and list(kind.columns.values()) == ["length"]:
-            accepted += f", or rename '{lengths[0]}'"
-        raise InputError(where, error.found, accepted, error.file or next(iter(of_column), read.file)) from None
+        raise InputError(where, error.found, error.accepted, error.file or next(iter(of_column), read.file)) from None
 
 
 def interpret_tables(

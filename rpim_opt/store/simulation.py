@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -78,14 +77,6 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
         raise InputError("table simulation", "nothing", "seed, configurations, ...", definition.path)
     plan = validate(Simulation, definition.table.simulation, definition.path, "simulation")
     rng = np.random.default_rng(plan.seed if seed is None else seed)
-    taken: set[Path] = set()  # nothing else may have a table's name
-    for each, role in product(definition.observations, ("identification", "validation")):
-        file = getattr(each, role)
-        if file:
-            place = inside(definition.path.parent, file, f"key {role}", definition.path).resolve()
-            if place.suffix.lower() != ".csv" or place in taken:
-                raise InputError(f"key {role}", f"{file!r}", "a unique name for every table, in .csv", definition.path)
-            taken.add(place)
     fixtures, parameters = _parameters(definition)
     free = parameters.free
     x = plan.spread * rng.normal(size=len(free)) * free.scale
@@ -93,7 +84,8 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
     with in_file(definition.path):
         for (name, _), value in quantities(plan.truth, dimensions, "table simulation.truth").items():
             x[free.names.index(name)] = value
-    texts: dict[str, str] = {}
+    folder = out or definition.path.parent
+    texts: dict[Path, str] = {}
     blunders: list[str] = []
     for role, count in (("identification", plan.configurations), ("validation", plan.validation)):
         with in_file(definition.path):
@@ -101,25 +93,27 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
             q = random_candidates(definition.robot, 2 * count, rng, plan.joint_share)
         for each, of in zip(definition.observations, fixtures, strict=True):
             file = getattr(each, role)
+            if not (count and file):
+                continue
+            place = inside(folder, file, f"key {role}", definition.path)
+            if place.suffix.lower() != ".csv" or place.resolve() in map(Path.resolve, texts):
+                raise InputError(f"key {role}", f"{file!r}", "a unique name for every table, in .csv", definition.path)
             markers = tuple(plan.markers.get(each.identification, definition.tools))
             for marker in markers:
                 pick(definition.tools, marker, "table simulation.markers", definition.path)
-            if count and file:
-                kind = definition.kinds[each.measurement]
-                maker = _Table(definition, plan, parameters, x, each, kind, markers, of, rng, role == "identification")
-                columns, wrong = maker.made(q)
-                texts[file] = csv_text(columns, zip(*columns.values(), strict=True))
-                blunders += wrong
+            kind = definition.kinds[each.measurement]
+            maker = _Table(definition, plan, parameters, x, each, kind, markers, of, rng, role == "identification")
+            columns, wrong = maker.made(q)
+            texts[place] = csv_text(columns, zip(*columns.values(), strict=True))
+            blunders += wrong
     labels = ", ".join(f'"{label}"' for label in blunders)
     lines = [f"# made by: rpim-opt simulate {Path(name).name}", f"blunders = [{labels}]", "", "[deviation]"]
     for parameter, dimension, value in zip(free.names, free.dimensions, x.tolist(), strict=True):
         unit, si = display(dimension)
         lines.append(f"{f'{parameter}_{unit}'.rstrip('_')} = {value / si:.12g}")
-    texts["truth.toml"] = "\n".join(lines) + "\n"
-    folder = out or definition.path.parent
-    places = {inside(folder, file, "the file", folder): text.encode() for file, text in texts.items()}
-    write_files(places)
-    return list(places)
+    texts[inside(folder, "truth.toml", "the file", folder)] = "\n".join(lines) + "\n"
+    write_files({place: text.encode() for place, text in texts.items()})
+    return list(texts)
 
 
 def _parameters(stated: ProblemFile) -> tuple[list[tuple[str, ...]], Parameters]:
@@ -166,10 +160,6 @@ class _Table:
             return self._touched(), []
         if self.kind.by_camera:
             return self._seen(len(random) // 2), []
-        return self._measured(random)
-
-    def _measured(self, random: Array) -> tuple[Columns, list[str]]:
-        """Return a table of measured values, or of configurations on a plane or sphere."""
         kind = self.kind
         count = len(random) // 2
         columns, rows = self._labelled(count)
@@ -177,7 +167,7 @@ class _Table:
         torque = None
         if self.plan.torques == "measured" and any(n.startswith("compliance") for n in self.parameters.free.names):
             torque = self.rng.uniform(-TORQUE, TORQUE, q.shape).round(3)
-        constraint = not kind.columns
+        constraint = not kind.columns  # configurations on a plane or sphere
         columns |= self._joints(q, EXACT_DIGITS if constraint else DIGITS, torque)
         values = np.zeros((len(rows), len(kind.columns)))
         values[:, [i for i, name in enumerate(kind.columns) if name == "qw"]] = 1.0  # no turn

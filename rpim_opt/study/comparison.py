@@ -422,11 +422,8 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
     else:
         scope = "these problems alone, with other seeds or folds"
     if compared:
-        text = f"Intervals refer to {scope} (bootstrap, {CONFIDENCE:.0%}); * excludes 1."
-        if compared > 1:
-            text += " No correction for multiple comparisons: without any difference, "
-            text += f"{(1 - CONFIDENCE) * compared:.2g} of {compared} would be marked by chance."
-        yield text
+        several = " They are not corrected for multiple comparisons." if compared > 1 else ""
+        yield f"Intervals refer to {scope} (bootstrap, {CONFIDENCE:.0%}); * excludes 1.{several}"
     elif len(standings) > 1:
         yield f"There are no intervals: fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one."
     every = Counter(row["method"] for row in rows)

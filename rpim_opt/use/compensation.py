@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -26,7 +25,6 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.closed_forms import register, transformed
 from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_known_masses, require_same_torques
 from rpim_opt.robot import kinematics
 from rpim_opt.robot.chain import placed
@@ -78,8 +76,8 @@ class Compensation:
     joints count whose signs or zeros were estimated, and of which session the instrument's frame is; ``point`` which
     point is moved, and why orientations are not corrected; ``source`` names the calibration. ``beside`` (N,) [m] is how
     far a stated position is from that of the nominal robot at the joint values stated beside it, NaN where there are
-    none. ``after_motion`` is the RMS of uncorrected position errors [m] that one motion of all targets leaves, NaN for
-    fewer than `MOVED` of them or targets on a line; ``std_after_motion`` that of standard uncertainties.
+    none. ``std_after_motion`` is the RMS [m] of the standard uncertainties that one motion of all targets leaves, NaN
+    for fewer than `MOVED` of them.
     """
 
     robot: Robot
@@ -99,7 +97,6 @@ class Compensation:
     point: str = ""
     limit: float = np.inf
     source: str = ""
-    after_motion: float = np.nan
     std_after_motion: float = np.nan
 
     def __str__(self) -> str:
@@ -116,15 +113,13 @@ class Compensation:
                 shown = (values.mean(), np.sqrt(np.mean(values**2)), values.max())
                 figures.append([name, *(f"{1e3 * value:.4f}" for value in shown)])
         changes = (f"{name.replace('_', f' {value:.3f} ')}" for name, value in self._largest_corrections().items())
-        moved = f" (after a common displacement of all targets {1e3 * self.after_motion:.4f} mm RMS)"
         flange = 1e3 * forward_kinematics(self.robot, np.zeros((1, self.robot.dof)))[0, :3, 3]
         lines = [
             table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
             f"Largest corrections: {', '.join(changes)}.",
             "Targets are stated in the robot's base frame, in which the nominal flange at zero joint values is at x "
             f"{flange[0]:z.3f} y {flange[1]:z.3f} z {flange[2]:z.3f} mm. Uncorrected errors refer to the identified "
-            f"base{moved if self.after_motion < rms(self.position_before) / 2 else ''}; nominal errors in a report "
-            "refer to a refitted base and tool.",
+            "base; nominal errors in a report refer to a refitted base and tool.",
         ]
         if self.std_after_motion < rms(self.std) / 2:
             whole, left = (f"{1e3 * EXPANDED * each:.4f} mm" for each in (rms(self.std), self.std_after_motion))
@@ -377,14 +372,11 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
             f" Orientations are not corrected: those of {vague} of {len(targets.label)} targets are known no better "
             "than by the nominal robot; --orientation corrects them anyway."
         )
-    there, targets_at = fields.pop("there"), fields.pop("targets_at")
+    there = fields.pop("there")
     if len(there) >= MOVED:
-        with suppress(InputError):
-            left = targets_at - transformed(register(there, targets_at), there)
-            fields["after_motion"] = rms(np.linalg.norm(left, axis=1))
-            few = slice(None, None, -(-len(there) // BLOCK))
-            some = Targets._make(None if each is None else each[few] for each in targets)
-            fields["std_after_motion"] = rms(cell.uncertainty(fields["q"][few], some, there[few])[0])
+        few = slice(None, None, -(-len(there) // BLOCK))
+        some = Targets._make(None if each is None else each[few] for each in targets)
+        fields["std_after_motion"] = rms(cell.uncertainty(fields["q"][few], some, there[few])[0])
     return fields, why
 
 
@@ -424,7 +416,7 @@ def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
 # --- the controller's robot beside the identified one ------------------------------------------------------
 
 Aim = tuple[Array, Array, Array, Array, Array]
-"""Of N targets: commands (N, dof) of the nominal controller, poses (N, c), loads (N, l), their errors (N, k), `beside`."""
+"""Of N targets: commands (N, dof) of the nominal controller, poses (N, c), loads (N, l), errors (N, k), `beside`."""
 
 
 class _Cell:
@@ -518,8 +510,7 @@ class _Cell:
     def corrected(self, targets: Targets, aim: Aim, largest: float, turning: bool, choice: bool) -> dict[str, Array]:
         """Return the fields of a `Compensation` for some targets, with their orientations or, not ``turning``, without.
 
-        Of a ``choice`` positions come first. ``there`` (N, 3) are the positions of uncorrected commands, ``targets_at``
-        (N, 3) where the nominal robot has them.
+        Of a ``choice`` positions come first. ``there`` (N, 3) are the positions of uncorrected commands.
         """
         commands, target, load, missed, beside = aim
         pose_before, before, J = self.identified(commands, load, target)
@@ -551,8 +542,7 @@ class _Cell:
         met = is_reached(left if turning else left * KEPT[:k], counts)
         cases = {"ok": met, "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
-        fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
-        fields |= {"there": pose_before[:, :3], "targets_at": pose_before[:, :3] + (before - missed)[:, :3]}
+        fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status, "there": pose_before[:, :3]}
         fields["position_before"], fields["orientation_before"] = norms(before)
         error = self.identified(corrected, load, target)[1]
         fields["position_error"], fields["orientation_error"] = norms(error)
@@ -573,7 +563,7 @@ class _Cell:
         J[:, :, self.own] = problem.jacobian(self.x).reshape(N, k, -1)
         if moved is not None:
             motions = np.concatenate([np.tile(np.eye(3), (N, 1, 1)), np.cross(moved[:, None], np.eye(3))], axis=2)
-            Q = np.linalg.qr(motions.reshape(3 * N, 6))[0]
+            Q = scipy.linalg.orth(motions.reshape(3 * N, 6))
             of_positions = J[:, :3].reshape(3 * N, -1)
             J[:, :3] = (of_positions - Q @ (Q.T @ of_positions)).reshape(N, 3, -1)
         position_and_turn = (self.fit_covariance.of_positions(J[:, i : i + 3]) for i in range(0, k, 3))

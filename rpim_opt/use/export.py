@@ -205,9 +205,8 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
         doubt = accepted.summary if accepted.verdict == "inconclusive" else ""
         remarks += [accepted.summary] if accepted.verdict == "accepted" else []
     undecided = bool(doubt) and verdict.delivered
-    note = " ".join(
-        filter(None, [verdict.require(despite_verdict), doubt if undecided else "", *underdetermined(alone)])
-    )
+    notes = [verdict.require(despite_verdict), doubt if undecided else "", *underdetermined(alone)]
+    note = " ".join(filter(None, notes))
     if alone is whole or found is None:
         return note, [], remarks, undecided
     stays = np.linalg.norm(alone.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
@@ -244,13 +243,12 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         return problem.with_parameters(replace(p, nominal=nominal, identified=np.isin(p.names, free) & ~zero))
 
     learned, penalty = result.learned, result.formulation.penalty
-    selected, added, left_out = (
-        ((), (), ()) if learned is None else (learned.extensions, learned.added, learned.left_out)
-    )
+    selected, added = ((), ()) if learned is None else (learned.extensions, learned.added)
+    left_out = set() if learned is None else {row.label for row in learned.left_out}
     lost = [each for each in selected if each not in CONDITIONS]
     lost += [name for name, value in beyond.items() if value and name not in added]
     if penalty is None or getattr(penalty, "maker", "") != prior_penalty.__name__:
-        stated = bare(result.stated).without({row.label for row in left_out})
+        stated = bare(result.stated).without(left_out)
         try:
             alone = result.calibrate_again(stated, model="geometry")
         except (InputError, ValueError) as error:  # of functions of a user's own
@@ -392,17 +390,10 @@ def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: 
         return []
     if not np.isfinite([position, turn]).all():
         return ["URDF: the pose of its tip link is undetermined: check position and orientation by other means."]
-    rests = (
-        ""
-        if turns_measured(problem)
-        else ". Positions of one reflector determine only part of its pose, the prior the rest"
-    )
-    measured = ""
-    if tool is not None:
-        measured = f"the reflector {2e3 * tool_uncertainty(result, q, None, name, robot)[0].max():.2g} mm, "
+    rests = " Positions of one reflector determine only part of its pose, the prior the rest."
     return [
         "URDF: expanded uncertainty in the instrument's frame (k = 2, largest of the measured configurations): "
-        f"{measured}{tip} {2e3 * position:.2g} mm and {2e3 * turn:.2g} mrad{rests}."
+        f"{tip} {2e3 * position:.2g} mm and {2e3 * turn:.2g} mrad.{rests * (not turns_measured(problem))}"
     ]
 
 

@@ -82,10 +82,8 @@ class Performance(Tabled):
         lines: list[str] = []
         cycles = sorted({each["cycles"] for each in self.poses})
         if cycles[0] < CYCLES or len(self.poses) < POSES:
-            times = " to ".join(str(count) for count in dict.fromkeys((cycles[0], cycles[-1])))
-            verb = "are" if len(self.poses) > 1 else "is"
-            there = f"there {verb} {counted(len(self.poses), 'pose')}, approached {times} times"
-            lines.append(f"The standard requires {POSES} poses, {CYCLES} approaches each: {there}.")
+            found = f"{counted(len(self.poses), 'pose')}, the least with {cycles[0]} approaches"
+            lines.append(f"The standard requires {POSES} poses, {CYCLES} approaches each: the table has {found}.")
         if self.accuracy is None:
             lines.append("No commanded poses are known: repeatability is computed, accuracy is not.")
         return lines

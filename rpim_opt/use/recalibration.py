@@ -21,7 +21,7 @@ from rpim_opt.calibration.held_out import displacement, registered, registration
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.lack_of_fit import TOGETHER, judged
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import held_out_errors, transmission_errors
+from rpim_opt.calibration.uncertainty import held_out_errors
 from rpim_opt.calibration.verdict import refuse_misread
 from rpim_opt.convex.constraints import matching
 from rpim_opt.convex.expressions import SQUARES
@@ -87,21 +87,6 @@ class Moved(NamedTuple):
         return {"name": self.name, "unit": unit, "change": self.change / si, "std": self.std / si}
 
 
-class Resized(NamedTuple):
-    """RMS of a joint's transmission error [rad] before and after a change of its coefficients."""
-
-    name: str
-    before: float
-    after: float
-
-    def __str__(self) -> str:
-        return f"{self.name} from {1e3 * self.before:.3g} to {1e3 * self.after:.3g} mrad RMS"
-
-    def content(self) -> dict[str, Any]:
-        """Return it as a document [mrad]."""
-        return {"name": self.name, "unit": "mrad", "before": 1e3 * self.before, "after": 1e3 * self.after}
-
-
 @dataclass(frozen=True, eq=False)
 class Update:
     """A recalibration with the previous result as prior.
@@ -109,8 +94,7 @@ class Update:
     ``result`` is the calibration, whose record has the previous one; ``before`` and ``after`` are how the ``readings``
     (their number) fit that, and with the changes. ``changes`` are parameters and frames that changed, and wrong
     readings, which were left out, in the order of their discovery; ``causes`` all that may have changed, with its
-    evidence before anything was released, the most probable first; ``moved`` by how much the released parameters did,
-    of a joint's transmission error its sizes.
+    evidence before anything was released, the most probable first; ``moved`` by how much the released parameters did.
     ``errors`` [mm] are those of both calibrations on the readings that were not left out, and on rows held out of the
     previous one, where nothing was released. ``registered`` is whether the instrument or the base moved so far that the
     base was registered again; else empty. ``undetermined`` are the frames that were released, or are new, and that the
@@ -122,7 +106,7 @@ class Update:
     after: Fit
     changes: tuple[Cause, ...]
     causes: tuple[Cause, ...]
-    moved: tuple[Moved | Resized, ...]
+    moved: tuple[Moved, ...]
     readings: int
     errors: Mapping[str, Mapping[str, Any]]
     registered: str = ""
@@ -302,7 +286,7 @@ def update(
     elsewhere = " ".join(filter(None, [elsewhere, said]))
     updated = replace(updated, record=_carried_on(result.record, last, source))
     moved = _moved(result, updated, released, changes)
-    unclear = {each.name for each in moved if isinstance(each, Moved) and abs(each.change) < 2 * each.std}
+    unclear = {each.name for each in moved if abs(each.change) < 2 * each.std}
     vague += tuple(cause.name for cause in changes if unclear.issuperset(cause.members))
     return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
 
@@ -467,8 +451,8 @@ def _changes(result: Calibration, data: Dataset) -> tuple[tuple[Cause, ...], Fit
 
 def _moved(
     result: Calibration, updated: Calibration, released: Sequence[str], changes: Sequence[Cause]
-) -> tuple[Moved | Resized, ...]:
-    """Return by how much released parameters moved; of those that were reset, it is the difference of the results.
+) -> tuple[Moved, ...]:
+    """Return by how much released parameters moved, but coefficients of curves; of those that were reset, from both.
 
     Of those that changed, what neither result knows of them is in both, and no change.
     """
@@ -479,10 +463,7 @@ def _moved(
     reset = [name for name in released if name not in changed]
     # deviations of a frame registered again refer to another orientation: values do not
     was, now = (each.problem.parameters.by_name(each.x) for each in (result, updated))
-    moved: list[Moved | Resized] = []
-    for before, after in zip(transmission_errors(result), transmission_errors(updated), strict=True):
-        if set(before.names) & set(released):
-            moved.append(Resized(f"transmission error of {before}", before.rms, after.rms))
+    moved: list[Moved] = []
     for name in [name for name in reset if name in result.problem.parameters.free.names and name not in curves]:
         i = free.names.index(name)
         std = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])

@@ -353,14 +353,14 @@ def test_a_held_out_row_that_the_last_fit_excludes_is_in_the_headline_and_named_
     errors = 1e3 * found.record.held_out.error
     said = headline(found)
     assert f"to {np.delete(errors, 7).mean():.3f} mm" in said
-    excluded = "Not counted: held-out rows validation:c7, excluded from the fit to all rows"
-    assert f"{excluded}; with all of them the mean error is {errors.mean():.3f} mm." in said
+    excluded = "Not counted: held-out rows validation:c7, excluded from the fit to all rows."
+    assert excluded in said
     others = validation.take(np.delete(np.arange(len(validation)), 7))
     assert found.record.held_out.coverage == pytest.approx(ro.use.validate(result, others).coverage)
     tested = accept(found, Requirement(1e-3))
     assert tested.content()["checked"]["rows"] == 39
     assert tested.content()["checked"]["excluded"] == ["validation:c7"]
-    assert str(tested).endswith(f"{excluded}.")
+    assert str(tested).endswith(excluded)
     assert tested.content()["checked"]["coverage95"] == found.record.held_out.coverage
 
 

@@ -575,15 +575,6 @@ def test_each_of_the_fewer_has_its_own_partner() -> None:
     np.testing.assert_allclose(turned[2], -apart)
 
 
-def test_a_length_of_another_name_is_offered(monkeypatch, capsys, tmp_path, arm) -> None:
-    path = tmp_path / "train.csv"
-    path.write_text(text([[*HEAD[:7], "length_mm"]], [[*row[:8]] for row in ROWS]))
-    assert new(monkeypatch, arm, tmp_path / "cell", path, "--measurement", "distance") == 2
-    said = capsys.readouterr().err
-    assert "train.csv, the header: found no column for 'distance'" in said
-    assert ", or rename 'length_mm'." in said
-
-
 def test_columns_of_other_names_join_two_files(monkeypatch, capsys, tmp_path, arm) -> None:
     """Running numbers of both files do not: the tracker's rows have another order."""
     joints = tmp_path / "robot.csv"

@@ -178,17 +178,6 @@ def test_an_orientation_of_unknown_uncertainty_is_not_corrected() -> None:
     assert "Orientations are not corrected: those of 5 of 5 targets" in str(found)
 
 
-def test_what_is_one_motion_of_all_targets_is_said() -> None:
-    """The zero of the first joint, about a vertical axis, turns all targets as another base would."""
-    result, q = known(), commands(ARM)
-    free = result.problem.parameters.free.names
-    turned = replace(result, x=np.where([name == "theta1" for name in free], 2e-3, 0.0))
-    found = ro.use.compensate(turned, q, despite_verdict=True)
-    assert rms(found.position_before) > 1e-4
-    assert found.after_motion == pytest.approx(0, abs=1e-9)
-    assert "after a common displacement of all targets 0.0000 mm RMS" in str(found)
-
-
 def test_the_limit_of_a_result_holds_for_its_commands() -> None:
     result, q = calibrated()[0], commands(ARM, 5)
     required = replace(result, record=replace(result.record, requirement=ro.data.Requirement(2e-4)))
