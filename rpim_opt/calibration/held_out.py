@@ -16,7 +16,7 @@ from rpim_opt.calibration.uncertainty import held_out_errors
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.record import UNLIKELY, HeldOut
-from rpim_opt.problem.diagnosis import common_rows
+from rpim_opt.problem.causes.rows import common_rows
 from rpim_opt.problem.registration.closed_forms import register, transformed
 from rpim_opt.robot.parameters import Parameters, of_session, session_prefix
 

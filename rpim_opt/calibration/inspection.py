@@ -19,8 +19,9 @@ from rpim_opt.calibration.lack_of_fit import LackOfFit, judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.words import contact_remarks
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.causes.positions import better_interpretations
+from rpim_opt.problem.causes.rows import all_q, beyond_limits, hardly_moved
 from rpim_opt.problem.design import Observability, observe
-from rpim_opt.problem.diagnosis import all_q, better_interpretations, beyond_limits, hardly_moved
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.frames import fitted_frames

@@ -21,20 +21,38 @@ from rpim_opt.convex.program import pose
 from rpim_opt.convex.robust_loss import by_place
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
-from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.diagnosis import (
+from rpim_opt.problem.causes.misreadings import Better, better_interpretation, sibling
+from rpim_opt.problem.causes.positions import (
+    better_interpretations,
+    computed_columns,
+    odd_column,
+    other_places,
+    other_rows,
+    single_rows,
+    unrelated_rows,
+)
+from rpim_opt.problem.causes.residuals import MOVED, NOISY, NOTICED, SLIGHT, shown_by_residuals
+from rpim_opt.problem.causes.rows import (
     ANGULAR,
-    NOISY,
-    NOTICED,
     REACH,
-    SLIGHT,
+    all_q,
+    beyond_limits,
+    copied_rows,
     decimals_of,
+    every_rounding,
+    filled_rows,
     first,
     hardly_moved,
+    in_table_order,
+    left_out_together,
     moved_one_by_one,
+    rounded,
+    roundings,
+    rows_without_values,
+    shared_rows,
+    stretched_length,
 )
-from rpim_opt.problem.misreadings import Better, better_interpretation, sibling
 from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
@@ -193,7 +211,7 @@ def _little_motion(result: Outcome) -> Iterator[str]:
         )
     problem = result.problem.sample()
     if not result.record.earlier and any(
-        moved_one_by_one(arm, diagnosis.all_q(problem.alone(name).data)) for name, arm in problem.arms.items()
+        moved_one_by_one(arm, all_q(problem.alone(name).data)) for name, arm in problem.arms.items()
     ):
         yield (
             "In nearly all rows one joint alone differs from a common configuration, so that the data do not show how "
@@ -302,7 +320,7 @@ def stated_variance(problem: Source, dimension: str) -> Array:
 def arm_length(problem: Source) -> float:
     """Return the length of the longest arm stretched out [m], prismatic joints as far as they were measured."""
     return max(
-        diagnosis.arm_length(robot, (block for part in problem.rows() for block in part.data.blocks))
+        stretched_length(robot, (block for part in problem.rows() for block in part.data.blocks))
         for robot in problem.arms.values()
     )
 
@@ -461,7 +479,7 @@ def _computed(result: Outcome) -> Iterator[str]:
     if nominal < COMPUTED_RMS and noise_ratio(problem, errors) < COMPUTED:
         beside = "far below the measurement noise: the data seem to be computed from this robot, not measured."
     elif min(rounding) > 0 and nominal < ROUNDED * np.hypot(
-        max(rounding), sum(each.made for each in diagnosis.every_rounding(problem.sample()) if each.step)
+        max(rounding), sum(each.made for each in every_rounding(problem.sample()) if each.step)
     ):
         beside = "no more than rounding makes: the data seem to be computed from this robot, or have too few decimals."
     if beside:
@@ -499,10 +517,10 @@ def likely_causes(result: Outcome) -> list[str]:
     noticed = max(ratio for _, ratio in residuals.values()) > NOTICED
     signs = [*_large_residuals(result, residuals), *_large_deviations(result)]
     head = [f"{BAD}: {'; '.join(signs)}."] if signs else []
-    ordered = diagnosis.in_table_order(problem, result.excluded, result.record.validation)
-    shared = [*diagnosis.shared_rows(problem.data, result.record.validation), *diagnosis.copied_rows(problem.data)]
+    ordered = in_table_order(problem, result.excluded, result.record.validation)
+    shared = [*shared_rows(problem.data, result.record.validation), *copied_rows(problem.data)]
     left_out = () if result.learned is None else result.learned.left_out
-    together = list(diagnosis.left_out_together(problem.labels, {row.label for row in left_out}))
+    together = list(left_out_together(problem.labels, {row.label for row in left_out}))
     if result.mapping is not None:
         shared += result.mapping.ambiguities
     if known:
@@ -517,7 +535,7 @@ def likely_causes(result: Outcome) -> list[str]:
             explanations.insert(0, explanations.pop())
         causes = [
             *first(*explanations, _residual_causes(result, problem, ordered)),
-            *diagnosis.computed_columns(problem),
+            *computed_columns(problem),
         ]
         ignored = result.record.details.get("ignored_joints")
         if ignored:
@@ -546,15 +564,13 @@ def _beside_a_good_fit(
     beyond the noise.
     """
     kept, parts = kept_rows(result), of_sessions(ordered)
-    causes = list(diagnosis.filled_rows(ordered.data))  # which may fit
+    causes = list(filled_rows(ordered.data))  # which may fit
     if result.excluded is not None and len(problem.arms) == 1:
         by_result = [replace(part, robots=result.robot) for part in parts]
-        explained = (diagnosis.other_places, diagnosis.other_rows)
-        causes = first(
-            *map(diagnosis.single_rows, parts), *(explain(part) for explain in explained for part in by_result)
-        )
+        explained = (other_places, other_rows)
+        causes = first(*map(single_rows, parts), *(explain(part) for explain in explained for part in by_result))
     elif result.excluded is not None or not kept.all():
-        causes = first(*map(diagnosis.single_rows, parts))
+        causes = first(*map(single_rows, parts))
     if causes:
         causes[-1] += " The other rows fit: calibrate again with these corrected, or left out ([exclude])."
         return causes, []
@@ -566,14 +582,14 @@ def _beside_a_good_fit(
     alone, x = _without_outliers(result, ordered, again=noticed)
     error = rms(problem.errors(result.x)[kept])
     causes = first(
-        diagnosis.shown_by_residuals(alone, x) if noticed else (),
-        diagnosis.roundings(problem, error, (1 - diagnosis.MOVED) ** -0.5) if noticed else (),
+        shown_by_residuals(alone, x) if noticed else (),
+        roundings(problem, error, (1 - MOVED) ** -0.5) if noticed else (),
         _in_place_of_extensions(result, alone),
     )
     if causes:
         return causes, together
-    slight = diagnosis.roundings(problem, error, (1 - SLIGHT) ** -0.5)
-    effects = first(slight, diagnosis.shown_by_residuals(alone, x, most=SLIGHT))
+    slight = roundings(problem, error, (1 - SLIGHT) ** -0.5)
+    effects = first(slight, shown_by_residuals(alone, x, most=SLIGHT))
     return [], [*(f"{SLIGHTLY}: {text}" for text in effects), *together]
 
 
@@ -702,15 +718,13 @@ def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
 def _other_readings(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> Iterator[str]:
     """Say what is wrong with single rows, and what explains all or some of them if they are read otherwise."""
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
-        yield from diagnosis.rows_without_values(problem.data, problem.arms)
+        yield from rows_without_values(problem.data, problem.arms)
         return
     explained = max(ratio for _, ratio in residual_rms(result, kept_rows(result)).values()) < NOTICED
     most = REACH * arm_length(problem) if explained else np.inf  # else wrong lengths explain more
     # beside single rows, which may be the ones where something changed
     parts = of_sessions(ordered)
-    yield from first(
-        *(chain(diagnosis.single_rows(part), diagnosis.better_interpretations(part, most)) for part in parts)
-    )
+    yield from first(*(chain(single_rows(part), better_interpretations(part, most)) for part in parts))
 
 
 def _residual_causes(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> Iterator[str]:
@@ -719,13 +733,13 @@ def _residual_causes(result: Outcome, problem: CalibrationProblem, ordered: Cali
         return
     error = rms(problem.errors(result.x)[kept_rows(result)])
     beyond = error >= LARGEST["length"]  # what a robot's own effects may be
-    outside = diagnosis.beyond_limits(problem.robot, diagnosis.all_q(problem.data), OUTSIDE)
+    outside = beyond_limits(problem.robot, all_q(problem.data), OUTSIDE)
     yield from first(
         (f"{text}: check the unit and the column of its values." for text in outside),
         _shown_without_outliers(result, ordered),
-        diagnosis.rounded(problem, error),
-        diagnosis.odd_column(problem) if beyond else (),
-        diagnosis.unrelated_rows(problem, error),
+        rounded(problem, error),
+        odd_column(problem) if beyond else (),
+        unrelated_rows(problem, error),
     )
 
 
@@ -749,13 +763,13 @@ def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Ite
     single = [flag.label for flag in result.single]
     ratio, before = _worst_ratio(alone, x), _worst_ratio(ordered if result.squared_loss else alone, result.x)
     loss = "a squared loss" if result.squared_loss else "this loss"
-    if single and ratio <= min(NOISY, diagnosis.MOVED**0.5 * before):
+    if single and ratio <= min(NOISY, MOVED**0.5 * before):
         yield (
             f"outliers ({listed(single)}): without them residuals are {three_digits(ratio)} times the measurement "
             f"noise. They bias {loss}: use formulation 'robust', or leave them out ([exclude])."
         )
         return
-    yield from first(diagnosis.shown_by_residuals(alone, x), _in_place_of_extensions(result, alone))
+    yield from first(shown_by_residuals(alone, x), _in_place_of_extensions(result, alone))
 
 
 def _in_place_of_extensions(result: Outcome, alone: CalibrationProblem) -> Iterator[str]:
@@ -769,7 +783,7 @@ def _in_place_of_extensions(result: Outcome, alone: CalibrationProblem) -> Itera
     bare = cast(CalibrationProblem, result.stated).on(alone.data)
     plain = min((trial.value for trial in learned.trials if not trial.extensions), default=np.inf)
     most = np.exp((min(trial.value for trial in learned.trials) - plain) / result.program.model.equations)
-    yield from diagnosis.shown_by_residuals(bare, ridge_deviations(bare), most=min(diagnosis.MOVED, float(most)))
+    yield from shown_by_residuals(bare, ridge_deviations(bare), most=min(MOVED, float(most)))
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:
@@ -789,7 +803,7 @@ def refuse_misread(result: Outcome, data: Dataset) -> None:
 
 def misread(result: Outcome, data: Dataset) -> str:
     """Return the result of `better_fitting` as a sentence, or rows without values; empty where there is nothing."""
-    lost = next(diagnosis.rows_without_values(data, result.problem.arms), "")
+    lost = next(rows_without_values(data, result.problem.arms), "")
     if lost:
         return f"Likely: {lost}"
     better = better_fitting(result, data)

@@ -23,7 +23,7 @@ from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, Board, grid_b
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.tables.names import recognize
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.problem.diagnosis import rows_without_values
+from rpim_opt.problem.causes.rows import rows_without_values
 from rpim_opt.problem.multi_robot import NAME
 from rpim_opt.problem.problem import CalibrationProblem, identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, with_poses

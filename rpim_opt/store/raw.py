@@ -25,7 +25,7 @@ from rpim_opt.data.tables.joining import seconds, time_column, together
 from rpim_opt.data.tables.names import NUMBERED, ORDERS, recognize
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import CanonicalTable, Column, interpret
-from rpim_opt.problem.misreadings import pose_misfit
+from rpim_opt.problem.causes.misreadings import pose_misfit
 from rpim_opt.robot.chain import RobotSetup
 
 CLEARLY = 3.0  # The right reading of orientations, or mounting of a camera, leaves so many times less than another.

@@ -29,8 +29,10 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.quadratic import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier, Fit, HeldOut, Record
-from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
+from rpim_opt.problem.causes.positions import other_places, other_rows
+from rpim_opt.problem.causes.residuals import shown_by_residuals
+from rpim_opt.problem.causes.rows import FEWEST, first
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.multi_robot import identifying_sessions
 from rpim_opt.problem.problem import CalibrationProblem
@@ -434,12 +436,12 @@ def _between_rows(result: Calibration, data: Dataset) -> str:
     with suppress(InputError):  # what all rows share is no change; few positions, or on a line, register nothing
         data = registered(result, data)[0]
     held = held_out_errors(result, data)
-    if np.count_nonzero(held.sigmas > held.allowed) < diagnosis.FEWEST:  # outliers
+    if np.count_nonzero(held.sigmas > held.allowed) < FEWEST:  # outliers
         return ""
     problem = with_data(result, data)
-    residuals = diagnosis.shown_by_residuals(problem, previous_deviations(result, problem))
+    residuals = shown_by_residuals(problem, previous_deviations(result, problem))
     problem = replace(problem, robots=result.robot)
-    said = diagnosis.first(residuals, diagnosis.other_places(problem), diagnosis.other_rows(problem))
+    said = first(residuals, other_places(problem), other_rows(problem))
     return f"Likely: {said[0]}" if said else ""
 
 

@@ -19,7 +19,7 @@ from rpim_opt.calibration.verdict import implausible, misread, worse_than_nomina
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
-from rpim_opt.problem.diagnosis import shared_rows
+from rpim_opt.problem.causes.rows import shared_rows
 from rpim_opt.use.recalibration import moved_or_changed
 from rpim_opt.use.sessions import registered_again
 

@@ -15,9 +15,11 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.calibration import inspect, likely_causes
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.problem import misreadings
-from rpim_opt.problem.diagnosis import left_out_together, odd_column, other_rows, rows_without_values, two_positions
-from rpim_opt.problem.misreadings import better_interpretation
+from rpim_opt.problem.causes import misreadings
+from rpim_opt.problem.causes.misreadings import better_interpretation
+from rpim_opt.problem.causes.positions import odd_column, other_rows
+from rpim_opt.problem.causes.residuals import two_positions
+from rpim_opt.problem.causes.rows import left_out_together, rows_without_values
 from rpim_opt.robot import read_robot
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.library import READY

@@ -13,7 +13,7 @@ import rpim_opt as ro
 from rpim_opt.data.measurements.camera import INTRINSICS, TARGET
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem import workspace as sight
-from rpim_opt.problem.misreadings import better_interpretation
+from rpim_opt.problem.causes.misreadings import better_interpretation
 from rpim_opt.problem.registration.camera import normalized, starting_camera, with_poses
 
 BOARD = ro.data.grid_board(4, 3, 0.05)

@@ -9,13 +9,8 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration.words import contact_remarks
-from rpim_opt.problem.diagnosis import (
-    other_places,
-    rounded,
-    rows_without_values,
-    shared_rows,
-    unrelated_rows,
-)
+from rpim_opt.problem.causes.positions import other_places, unrelated_rows
+from rpim_opt.problem.causes.rows import rounded, rows_without_values, shared_rows
 from tests.simulate import simulated
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration import inspect
-from rpim_opt.problem.diagnosis import odd_column, other_places
+from rpim_opt.problem.causes.positions import odd_column, other_places
 from tests.test_cli import run
 
 CLEAN = ("position", "pose", "markers", "cable", "distance", "mixed", "seven_axis", "tracker", "scara", "paper_arm")
