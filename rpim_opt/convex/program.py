@@ -346,7 +346,8 @@ class Program(Brief):
         constraints move them.
 
         ``damping`` is a term that keeps the solution near a point. With a ``solver`` of CVXPY, its ``settings`` or
-        ``verbose``, `problem` is solved by it, whatever the structure.
+        ``verbose``, `problem` is solved by it, whatever the structure; by Clarabel where loss and constraints share
+        variables of their own.
 
         InputError for a weight that is negative or not finite, and a solver that is not installed. NoSolutionFound
         when the solver does not end with "optimal", or its point misses the constraints; its ``conflict`` names what
@@ -354,7 +355,7 @@ class Program(Brief):
         """
         begin = time.perf_counter()
         weight = self._weight(weight)
-        if solver or settings or verbose:
+        if solver or settings or verbose or self.structure.joint:
             estimate = self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
         elif weight == 0 and not self.linear_penalty:  # what multiplies zero is no part of the program
             alone = self._part(self.structure.without_penalty, self.model).solve(damping=damping)
@@ -403,7 +404,7 @@ class Program(Brief):
         Equations, inequalities and cones, linearized at z; own variables move along. None where no constraint is
         active, and with own variables that the loss shares, where it is not known.
         """
-        found = None if self.structure.joint else self._active(z, weight)
+        found = self._active(z, weight)
         if found is None:
             return None
         p, (optimum, active) = self.structure.canonical, found
@@ -433,10 +434,10 @@ class Program(Brief):
         """Return the minimum from z on, and which rows of the constraints are active there (m,), cones as a whole.
 
         An interior point leaves multipliers and slacks of which neither is zero: a constraint is active if its
-        multiplier is above its slack times the least curvature that the penalty has. None without constraints, and
-        where there is no minimum.
+        multiplier is above its slack times the least curvature that the penalty has. None without constraints, with own
+        variables that the loss shares, and where there is no minimum.
         """
-        if not self.formulation.constraints:
+        if not self.formulation.constraints or self.structure.joint:
             return None
         try:
             optimum = minimum(self._rows, WarmStart(self.structure).begin(z), weight)
@@ -473,14 +474,11 @@ class Program(Brief):
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
-        canonical, loss = self.structure.canonical, self.structure.loss
+        canonical = self.structure.canonical
         z = optimum.x[canonical.at]
         # half: the projection by which `violation` judges the point is no more exact
-        if self.structure.constrained and not self.structure.joint and canonical.missed(optimum.x) > 0.5 * FEASIBLE:
+        if self.structure.constrained and canonical.missed(optimum.x) > 0.5 * FEASIBLE:
             z = self.nearest(z)
-        if self.structure.joint and loss is not None and optimum.rest is not None:  # own variables as they are there
-            values = loss.canonical.value(optimum.rest) + self.model.offset, canonical.value(optimum.x)
-            self._values[z.tobytes(), weight] = values
         return self._at(z, weight, partial(self._duals, optimum), optimum.iterations)
 
     def _unidentified(self) -> Estimate:

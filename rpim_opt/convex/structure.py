@@ -269,7 +269,7 @@ class Structure:
         penalty = self.expressions.penalty_of_z
         with self._lock:
             constant = cp.Constant(0.0) if penalty is None else penalty
-            return Canonical(constant, self.expressions.flat, self.expressions.z, self.joint)
+            return Canonical(constant, self.expressions.flat, self.expressions.z)
 
     @cached_property
     def loss(self) -> Loss | None:
@@ -277,7 +277,7 @@ class Structure:
         if self.loss_form is not None:
             return None
         with self._lock:
-            return Loss(self.expressions.loss.expression, self.expressions.loss.variable, self.over_norms, self.joint)
+            return Loss(self.expressions.loss.expression, self.expressions.loss.variable, self.over_norms)
 
     # --- values ------------------------------------------------------------------------------------------------
 
@@ -290,13 +290,12 @@ class Structure:
         return bool(a.owned(a.loss.expression, a.penalty_of_z))
 
     @cached_property
-    def joint(self) -> list[cp.Variable]:
-        """The variables of their own that the loss shares with penalty or constraints."""
+    def joint(self) -> bool:
+        """Whether the loss shares variables of its own with penalty or constraints."""
         if self._declared:
-            return []
+            return False
         a = self.expressions
-        shared = a.owned(a.loss.expression) & a.owned(a.penalty_of_z, *a.flat)
-        return [v for v in a.loss.expression.variables() if v.id in shared]
+        return bool(a.owned(a.loss.expression) & a.owned(a.penalty_of_z, *a.flat))
 
     def values(self, z: Array, r: Array, weight: float) -> tuple[float, float]:
         """Return loss and penalty at numbers; minimized over the functions' own variables."""

@@ -76,16 +76,13 @@ MOST_ACTIVE_SETS = 40
 class Canonical:
     """minimize 1/2 x'P x + q'x + offset subject to b - A x in K, where ``x[at]`` is the variable of the functions.
 
-    ``x[shared]`` are the entries of own variables that another form has, too.
-
     Rows of a cone and columns that CVXPY added are scaled to unit size: a solver's tolerances are absolute, and
     constraints may be stated in metres.
     """
 
     own = False  # whether the functions have variables of their own
-    shared = np.zeros(0, dtype=int)
 
-    def __init__(self, objective: Any, constraints: Sequence[Any], variable: Any, shared: Sequence[Any] = ()):
+    def __init__(self, objective: Any, constraints: Sequence[Any], variable: Any):
         from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
         from scipy import sparse
 
@@ -95,15 +92,11 @@ class Canonical:
         for v in present.values():  # atoms ask for the value of what they are made of, and may get a stale one
             v.save_value(None)
         anchor = [] if variable.id in present else [variable == cp.Variable(variable.shape)]
-        copies = [cp.Variable(each.size) for each in shared]  # of a variable with attributes there is no column
-        same = [copied == cp.vec(each, order="F") for copied, each in zip(copies, shared, strict=True)]
-        problem = cp.Problem(cp.Minimize(objective), [*constraints, *anchor, *same])
+        problem = cp.Problem(cp.Minimize(objective), [*constraints, *anchor])
         self._chain: Any
         data, self._chain, self._inverse = problem.get_problem_data(cp.CLARABEL, solver_opts={})
         self.size = len(data["c"])
-        self._columns = data["param_prob"].var_id_to_col
-        self.at, *others = [self._columns[each.id] + np.arange(each.size) for each in (variable, *copies)]
-        self.shared = np.concatenate([self.shared, *others])
+        self.at = data["param_prob"].var_id_to_col[variable.id] + np.arange(variable.size)
         dims = data["dims"]
         self.cones = dims_to_solver_cones(dims)
         self.zero = int(dims.zero)
@@ -345,15 +338,11 @@ class ReducedSquares:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A minimum x (N,) of the canonical form, multipliers of its rows (m,), and the unknowns of the exact loss.
-
-    Of Clarabel's minima also the slacks of the rows (m,).
-    """
+    """A minimum x (N,) of the canonical form, multipliers of its rows (m,), and of Clarabel's minima their slacks."""
 
     x: Array
     dual: Array
     iterations: int = 0
-    rest: Array | None = None
     slack: Array = field(default_factory=lambda: np.zeros(0))
 
 
@@ -440,12 +429,12 @@ class ReducedProgram:
         if self.rows and not near.any():
             rows = np.vstack([squares.R, np.sqrt(weight + CENTRED * np.sum(squares.R**2)) * np.eye(n)])
             near[p.at] = np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0]
-        far = np.abs(near).max() > FAR and not len(p.shared)
+        far = np.abs(near).max() > FAR
         found = self._nearby(near, FEASIBLE, squares, weight, A, b) if far else None
         if found is None:
             found = self._about(near, squares, weight, A, b)
             missed = p.missed(found.x)
-            if (missed > ACCEPTED or np.abs(found.x).max() > FAR) and not len(p.shared):
+            if missed > ACCEPTED or np.abs(found.x).max() > FAR:
                 found = self._nearby(found.x, max(FEASIBLE, missed), squares, weight, A, b) or found
         self.near = found.x
         return found
@@ -508,14 +497,14 @@ class ReducedProgram:
         x, z, s = np.array(solution.x), np.array(solution.z) / scale, np.array(solution.s)
         x[: p.size] += near
         own = slice(k, k + len(p.b))
-        return Point(x[: p.size], z[own], int(solution.iterations), x[p.size + k :], s[own])
+        return Point(x[: p.size], z[own], int(solution.iterations), s[own])
 
 
 class _ConicData:
     """Clarabel's data of a small program. Unknowns are those of the penalty, R z - y, and those of the loss.
 
     Rows: R z - s = y, those of the penalty and of the loss, what the loss gets: v = A z - b, or for norms
-    (v_k, A_k z - b_k) in a second-order cone each, and that variables which both have are the same.
+    (v_k, A_k z - b_k) in a second-order cone each.
     """
 
     def __init__(self, p: Canonical, k: int, loss: Canonical | None, counts: np.ndarray | None):
@@ -542,13 +531,8 @@ class _ConicData:
                 cones += [clarabel.SecondOrderConeT(int(count) + 1) for count in counts]
                 entries += [(first, size + loss.at, -np.ones(len(first)))]
             dense += [_block(links, p.at)]
-            same = links[-1] + 1 + np.arange(len(loss.shared))
-            if len(same):
-                cones += [clarabel.ZeroConeT(len(same))]
-                entries += [(same, size + loss.shared, loss.column_scale[loss.shared])]
-                entries += [(same, p.shared, -p.column_scale[p.shared])]
             self._links = links - top
-            self._bounds = np.pad(loss.b, (0, int(links[-1]) + 1 - begin + len(same)))
+            self._bounds = np.pad(loss.b, (0, int(links[-1]) + 1 - begin))
             top += len(self._bounds)
             size += loss.size
         self._dense, self._entries, self._shape = dense, entries, (top, size)

@@ -8,7 +8,6 @@ and Saunders 2014, SIAM J. Optim. 24:1420).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -356,12 +355,11 @@ def gram(A: Array, weights: Array) -> Array:
 class Loss:
     """A loss f(v) that is not quadratic, of residuals v (M,), or where ``positive`` of configurations' norms.
 
-    Where it is ``separable``, f(v) = sum_i f_i(v_i), where it is the ``largest`` entry, f(v) = max_i f_i(v_i). It has
-    ``shared`` own variables with penalty or constraints.
+    Where it is ``separable``, f(v) = sum_i f_i(v_i), where it is the ``largest`` entry, f(v) = max_i f_i(v_i).
     """
 
-    def __init__(self, expression: Any, variable: Any, positive: bool, shared: Sequence[Any] = ()):
-        self.expression, self.variable, self.positive, self.shared = expression, variable, positive, shared
+    def __init__(self, expression: Any, variable: Any, positive: bool):
+        self.expression, self.variable, self.positive = expression, variable, positive
         self.piecewise_quadratic = bool(expression.is_qpwa())
         self.entries: Any = None
         self.largest = type(expression).__name__ == "max"
@@ -377,7 +375,7 @@ class Loss:
     @cached_property
     def canonical(self) -> Canonical:
         """The loss in canonical form."""
-        return Canonical(self.expression, [], self.variable, self.shared)
+        return Canonical(self.expression, [], self.variable)
 
     @cached_property
     def _evaluated(self) -> Evaluation:
