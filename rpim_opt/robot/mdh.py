@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, finite_numbers
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import Brief, shortened
 from rpim_opt.basics.units import LARGEST
@@ -82,13 +82,7 @@ class Gravity:
 
 def _vector(values: ArrayLike, where: str) -> Vector:
     """Return three finite numbers, none of them a negative zero."""
-    try:
-        array = np.asarray(values, dtype=float)
-    except (TypeError, ValueError):
-        array = np.empty(0)
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise InputError(where, f"{values}", "three finite numbers")
-    x, y, z = (array + 0.0).tolist()
+    x, y, z = (finite_numbers(where, values, (3,)) + 0.0).tolist()
     return x, y, z
 
 

@@ -188,8 +188,8 @@ def test_mountings_are_words_or_a_vector() -> None:
     ("wrong", "match"),
     [
         ({"direction": (0, 0, 0)}, "direction of gravity: found"),
-        ({"direction": (0, np.nan, 1)}, "three finite numbers"),
-        ({"direction": ("a", 0, 0)}, "three finite numbers"),
+        ({"direction": (0, np.nan, 1)}, "finite numbers of shape"),
+        ({"direction": ("a", 0, 0)}, "finite numbers of shape"),
         ({"payload": -1.0}, "payload: found -1.0"),
         ({"masses": (1.0,)}, "one centre per mass"),
         ({"masses": (np.inf,), "centres": ((0, 0, 0),)}, "mass of a link: found inf"),

@@ -136,6 +136,7 @@ class Canonical:
             made.q = -2 * L.T @ penalty.c
             made.offset = float(penalty.c @ penalty.c) + penalty.constant
             made.root = np.sqrt(2) * L
+        made.dense = made.A, made.P
         made.cones = None
         made.cone_sizes, made.second_order = [], 0
         return made
@@ -154,8 +155,6 @@ class Canonical:
     @cached_property
     def dense(self) -> tuple[Array, Array]:
         """A and P as dense matrices."""
-        if isinstance(self.A, np.ndarray):
-            return self.A, self.P
         return self.A.toarray(), self.P.toarray()
 
     @cached_property
@@ -588,10 +587,8 @@ def _assembled(entries: list[Entries], shape: tuple[int, int]) -> tuple[Any, np.
 
     rows, columns, numbers = (np.concatenate(each) for each in zip(*entries, strict=True))
     order = np.lexsort((rows, columns))
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
     starts = np.concatenate([[0], np.cumsum(np.bincount(columns, minlength=shape[1]))])
-    return sparse.csc_matrix((numbers[order], rows[order], starts), shape), place
+    return sparse.csc_matrix((numbers[order], rows[order], starts), shape), np.argsort(order)
 
 
 def nearest(p: Canonical, z: Array) -> Array:
