@@ -182,8 +182,7 @@ class Output(NamedTuple):
         if self.read is not None:
             lines += self.read.notes
             lines += [f"Ignored columns: {', '.join(self.read.left_out)}."] * bool(self.read.left_out)
-            document["left_out"] = self.read.left_out
-            document |= {"tables": self.read.notes} if self.read.notes else {}
+            document |= {"left_out": self.read.left_out, "tables": self.read.notes}
         if self.written is not None:
             lines += [f"Written: {file}" for file in self.written]
             document["written"] = self.written
@@ -299,14 +298,13 @@ def inspect(problem: Problem, variant: Variant = None) -> Output:
         validation = {} if apart is None else {name: apart.of_robot(name) for name in {*apart.robot}}
         prior = instance.prior if len(whole.arms) == 1 else None  # names of one robot's parameters may be others'
         parts = {name: ro.calibration.inspect(whole.alone(name), validation.get(name), prior) for name in whole.arms}
-        together = ro.problem.observe(whole) if len(parts) > 1 else None
+        together = f"\n\nAll robots together: {ro.problem.observe(whole)}" if len(parts) > 1 else ""
     document: dict[str, Any] = {"title": instance.record.title, "source": instance.record.source}
     text = "\n".join(filter(None, [instance.record.title, instance.record.source]))
     for name, part in parts.items():
         document |= {name: part.content()} if name else part.content()
         text += f"\n\nRobot {name}\n\n{part}" if name else f"\n\n{part}"
-    if together is not None:
-        text += f"\n\nAll robots together: {together}"
+    text += together
     refused = any(part.fit is not None and not part.fit.verdict.delivered for part in parts.values())
     return Output(text, document, int(refused))
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
+from types import ModuleType
 from typing import TypeGuard, TypeVar
 
 from rpim_opt.basics.exceptions import InputError
@@ -37,6 +38,17 @@ def is_own(name: object) -> TypeGuard[str]:
     return isinstance(name, str) and ":" in name
 
 
+def run_file(source: Path, name: str) -> ModuleType:
+    """Return the module of a Python file, which is run."""
+    spec = importlib.util.spec_from_file_location(name, source)
+    if spec is None or spec.loader is None:
+        raise InputError("the file", source.name, "a Python file", source)
+    content = importlib.util.module_from_spec(spec)
+    sys.modules[name] = content  # where classes of the file look for their annotations
+    spec.loader.exec_module(content)
+    return content
+
+
 def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
     """Return an object of a Python file beside ``file``, which names it at ``where``, if code is allowed."""
     module, _, attribute = name.partition(":")
@@ -44,13 +56,10 @@ def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
     if not _ALLOWED.get():
         accepted = "a name that comes with the package; or --allow-code, which runs that file with your permissions"
         raise InputError(where, f"'{name}', code of {source.name}", accepted, file)
-    spec = importlib.util.spec_from_file_location(f"rpim_opt_own.{module}", source)
-    if spec is None or spec.loader is None or not source.is_file():
+    if not source.is_file():
         raise InputError(where, f"'{name}', but no file {source.name}", "a file beside this one: copy it there", file)
-    content = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = content  # where classes of the file look for their annotations
     try:
-        spec.loader.exec_module(content)
+        content = run_file(source, f"rpim_opt_own.{module}")
     except (Exception, SystemExit) as error:  # code of somebody else may raise anything
         raise InputError(where, f"{type(error).__name__}: {error}", "code that runs without errors", source) from error
     named = getattr(content, attribute, None)

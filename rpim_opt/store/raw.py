@@ -190,8 +190,7 @@ def in_time_order(found: Interpretation) -> Interpretation:
     """Return labelled rows in the order of the first column of dates, or of times since 1970, if there is one."""
     columns = {"label": [str(i + 1) for i in range(found.count)], **found.columns}
     unused = [each.column for table in found.tables for each in table.meant if not each.name]
-    clocks = [column for column in unused if time_column([column.lower()])]
-    for name in clocks:
+    for name in (column for column in unused if time_column([column.lower()])):
         with suppress(InputError, KeyError):  # no times, or not of all rows
             times = seconds(name, found.raw[name.lower()])
             if times.min() > SINCE_1970:
@@ -200,9 +199,7 @@ def in_time_order(found: Interpretation) -> Interpretation:
                 tables = _with_meaning(found.tables, [name.lower()], meaning="order of the rows", why="times")
                 notes = (*found.notes, f"rows are in the order of '{name}'.")
                 return replace(found, columns=columns, raw=raw, tables=tables, notes=notes)
-    why = "neither dates (2026-05-31T12:00:00, 31.05.2026 12:00:00) nor times since 1970: the rows stay as they are"
-    tables = _with_meaning(found.tables, [name.lower() for name in clocks], why=why)
-    return replace(found, columns=columns, tables=tables)
+    return replace(found, columns=columns)
 
 
 def _with_meaning(tables: Sequence[CanonicalTable], columns: Sequence[str], **new: str) -> tuple[CanonicalTable, ...]:

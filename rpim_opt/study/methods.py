@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array, statistics
+from rpim_opt.basics.arrays import Array, finite_numbers, statistics
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.units import number
 from rpim_opt.calibration import baselines
@@ -233,12 +233,9 @@ def errors_by(returned: Any, problem: CalibrationProblem, label: str) -> Callabl
     n = len(problem.parameters.free)
     accepted = f"{n} finite deviations [SI], or a function from joint values (N, dof) to positions (N, 3) [m]"
     try:
-        x = np.asarray(getattr(returned, "x", returned), dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"method {label}", f"a {type(returned).__name__}", accepted) from None
-    if x.shape != (n,) or not np.isfinite(x).all():
-        found = f"numbers of shape {x.shape}" if np.isfinite(x).all() else "numbers that are not finite"
-        raise InputError(f"method {label}", found, accepted)
+        x = finite_numbers("x", getattr(returned, "x", returned), (n,))
+    except InputError as error:
+        raise InputError(f"method {label}", error.found, accepted) from None
     return lambda data, dimension: problem.on(data).errors(x, dimension)
 
 
@@ -250,9 +247,7 @@ def _predicted(predict: Callable[[Array], Any], data: Dataset, dimension: str) -
         kinds = ", ".join(f"{block.measurement.name} {' '.join(block.markers)}".strip() for block in data.blocks)
         raise InputError("predicted positions", kinds, "data of the positions of one reflector")
     block = data.blocks[0]
-    predicted = np.asarray(predict(block.q[:, 0]), dtype=float)
-    if predicted.shape != block.y.shape:
-        raise InputError("predicted positions", f"shape {predicted.shape}", f"{block.y.shape} [m]")
+    predicted = finite_numbers("predicted positions", predict(block.q[:, 0]), block.y.shape)
     errors = np.empty(len(data))
     errors[block.row] = np.linalg.norm(block.y - predicted, axis=1)
     return errors

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import importlib.util
 import io
 import json
 import os
@@ -30,6 +29,7 @@ from rpim_opt.basics.files import LARGEST_DATA, json_text, read_bytes, read_json
 from rpim_opt.basics.tables import library
 from rpim_opt.basics.text import Progress, version_of
 from rpim_opt.data.record import PACKAGES
+from rpim_opt.store.own_code import run_file
 from rpim_opt.store.problem_file import problems_folder
 
 NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
@@ -94,15 +94,10 @@ def _label(path: Path, quick: bool = False) -> str:
 @lru_cache(maxsize=8)
 def load_study(path: Path, needed: tuple[str, ...] = NEEDED) -> ModuleType:
     """Return a study: a Python file with the names that are ``needed``, which may import files beside it."""
-    spec = importlib.util.spec_from_file_location(f"study_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise InputError("the study", str(path), "a Python file")
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
     try:
-        spec.loader.exec_module(module)
+        module = run_file(path, f"study_{path.stem}")
     except SyntaxError as error:
         raise InputError(f"line {error.lineno}", str(error.msg), "Python", path) from None
     except ModuleNotFoundError as error:

@@ -46,7 +46,7 @@ STILL = 1e-9  # weight [m^2/rad^2] of the joints' motion there: no singular wris
 KEPT = np.array([1, 1, 1, 1e-4, 1e-4, 1e-4])  # `REACHED` is 1e-7 m, and 1 mrad where orientations are kept
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
 BANK = 2000  # configurations among which starts of a pose without one are sought
-TRIALS, MORE = 12, 36  # how many it tries in the measured ranges and then outside; in the ranges, where that reached it
+INSIDE, ANYWHERE = 48, 12  # how many it tries in the measured joint ranges, and then within limits
 NULL_SPACE_WEIGHT = 1e-10  # weight of a correction that moves nothing, relative to the largest squared singular value
 STEP_TOLERANCE = 1e-10
 DECREASE_TOLERANCE = 1e-6
@@ -330,35 +330,27 @@ def compensate(
         )
         if outside.rows:
             point += f" No solution in these ranges was found for {listed([targets.label[i] for i in outside.rows])}."
-    found = Compensation(
+    if tool is not None:
+        reflector = _Cell(result, robot, arm, kind, None, cell.marker, base, targets.torque is not None)
+        row = int(np.argmax(whole["std"]))
+        known = reflector.uncertainty(whole["q"][[row]], targets.take([row]))[0][0]
+        if whole["std"][row] > LESS_KNOWN * known:
+            at_tool, at_reflector = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (whole["std"][row], known))
+            point += (
+                f" In row {targets.label[row]}, U is {at_tool} at the tool and {at_reflector} at the reflector. "
+                "Measure a reflector as far from the flange as this point, and state what is known of the flange "
+                "(`known` in [prior]), which the data do not separate from the tool."
+            )
+    return Compensation(
         result.problem.arms[robot], targets.label, **whole, outside=outside, note=" ".join(filter(None, notes)),
         point=point, limit=limit, source=result.record.identity,
     )  # fmt: skip
-    if tool is None:
-        return found
-    reflector = _Cell(result, robot, arm, kind, None, cell.marker, base, targets.torque is not None)
-    return replace(found, point=point + _less_certain(reflector, found, targets))
-
-
-def _less_certain(reflector: _Cell, found: Compensation, targets: Targets) -> str:
-    """Say why a stated tool is less certain than the reflector, at its least certain row; empty where it is not."""
-    row = int(np.argmax(found.std))
-    there = Targets._make(None if each is None else each[row : row + 1] for each in targets)
-    known, of_tool = reflector.uncertainty(found.q[row : row + 1], there)[0][0], found.std[row]
-    if not of_tool > LESS_KNOWN * known:
-        return ""
-    of_tool, known = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known))
-    return (
-        f" In row {found.label[row]}, U is {of_tool} at the tool and {known} at the reflector. Measure a reflector as "
-        "far from the flange as this point, and state what is known of the flange (`known` in [prior]), which the data "
-        "do not separate from the tool."
-    )
 
 
 def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool | None) -> tuple[dict[str, Any], str]:
     """Return the fields of all rows, and whether orientations are corrected where that is not stated."""
-    starts = range(0, len(targets.label), BLOCK)
-    blocks = [Targets._make(None if v is None else v[i : i + BLOCK] for v in targets) for i in starts]
+    rows = np.arange(len(targets.label))
+    blocks = [targets.take(rows[i : i + BLOCK]) for i in range(0, len(rows), BLOCK)]
     choice = orientation is None and cell.kind is pose
     aims = on_all_cores(cell.aim, blocks)
     every = range(len(blocks))
@@ -374,9 +366,8 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
         )
     there = fields.pop("there")
     if len(there) >= MOVED:
-        few = slice(None, None, -(-len(there) // BLOCK))
-        some = Targets._make(None if each is None else each[few] for each in targets)
-        fields["std_after_motion"] = rms(cell.uncertainty(fields["q"][few], some, there[few])[0])
+        few = rows[:: -(-len(rows) // BLOCK)]
+        fields["std_after_motion"] = rms(cell.uncertainty(fields["q"][few], targets.take(few), there[few])[0])
     return fields, why
 
 
@@ -584,14 +575,11 @@ class _Cell:
         limits = self.robot.limits.T
         trials = [(q, limits)] if q is not None else self._trials(poses, load.shape[1])
         best, left = trials[0][0].copy(), np.full(len(poses), np.inf)
-        for number, (start, box) in enumerate(trials):
-            missing = left > REACHED
-            if number >= 2 * TRIALS:
-                missing = ~missing & ((best < box[0]) | (best > box[1])).any(axis=1)
-            again = np.flatnonzero(missing)
+        for start, box in trials:
+            again = np.flatnonzero(left > REACHED)
             other, error, _ = found(again, start[again], all_count, box)
             error = np.linalg.norm(error, axis=1)
-            better = error < np.maximum(left[again], REACHED)
+            better = error < left[again]
             best[again[better]] = other[better]
             left[again[better]] = error[better]
         if poses.shape[1] == 3 or n >= 6:
@@ -601,29 +589,27 @@ class _Cell:
     def _trials(self, poses: Array, loads: int) -> list[tuple[Array, Array]]:
         """Return configurations (N, dof) near every pose, and the box (2, dof) to go on in.
 
-        First `TRIALS` in the measured joint ranges, with half of what they may be exceeded by: the other half is for
-        the correction; then as many within limits, or a turn; then `MORE` in the ranges, for poses that were reached
-        outside.
+        First `INSIDE` in the measured joint ranges, with half of what they may be exceeded by: the other half is for
+        the correction; then `ANYWHERE` within limits, or a turn.
         """
         low, high = self.robot.limits.T
         low = np.where(np.isfinite(low), low, np.minimum(high, np.pi) - 2 * np.pi)
         high = np.where(np.isfinite(high), high, low + 2 * np.pi)
         spare = SLACK / 2 * np.ptp(self.ranges, axis=0)
-        measured = np.clip([self.ranges[0] - spare, self.ranges[1] + spare], *self.robot.limits.T)
+        limits = self.robot.limits.T
+        measured = np.clip([self.ranges[0] - spare, self.ranges[1] + spare], *limits)
         trials = []
-        for box in (measured, np.array([low, high])):
+        for box, within, count in ((measured, measured, INSIDE), (np.array([low, high]), limits, ANYWHERE)):
             bank = random_candidates(replace(self.robot, limits=box.T), BANK)
             reached = self.nominal(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
             distance = scipy.spatial.distance.cdist(poses[:, :3], reached[:, :3], "sqeuclidean")
             if poses.shape[1] == 7:
                 distance += 8 * (1 - np.abs(poses[:, 3:] @ reached[:, 3:].T))  # the angle's square, nearly
-            closest = np.argpartition(distance, TRIALS + MORE, axis=1)[:, : TRIALS + MORE]
+            closest = np.argpartition(distance, count, axis=1)[:, :count]
             order = np.argsort(np.take_along_axis(distance, closest, axis=1), axis=1)
             starts = bank[np.take_along_axis(closest, order, axis=1)]
-            within = box if box is measured else self.robot.limits.T
-            trials.append([(starts[:, i], within) for i in range(TRIALS + MORE)])
-        inside, anywhere = trials
-        return [*inside[:TRIALS], *anywhere[:TRIALS], *inside[TRIALS:]]
+            trials += [(starts[:, i], within) for i in range(count)]
+        return trials
 
 
 def norms(error: Array) -> tuple[Array, Array]:

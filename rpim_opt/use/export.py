@@ -137,9 +137,9 @@ def export_files(
     ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS), ``ur_calibration`` (``calibration.conf``) and
     ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot to correct, which go to ``out``, of several
     a folder. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`), ``robodk`` (.csv, four
-    numbers per joint, modified) and ``corrections`` are files to write, the last one the transmission errors, beside
-    others only where the model has any: ``joint``, ``angle_deg`` (the controller's), ``correction_mrad``, to be
-    subtracted from a command, and ``std_mrad``.
+    numbers per joint, modified) and ``corrections`` are files to write, the last one the transmission errors, without a
+    row where the model has none: ``joint``, ``angle_deg`` (the controller's), ``correction_mrad``, to be subtracted
+    from a command, and ``std_mrad``.
     ``marker`` is the reflector, ``robot`` which of several (`together`).
 
     ``root`` and ``tip``, links of the URDF between which the robot is, are by default those that it was read between.
@@ -156,10 +156,6 @@ def export_files(
     result, lost = geometry_alone(whole)
     note, of_geometry, remarks, undecided = _judged(whole, result, despite_verdict)
     of_geometry += [*lost, *session_notes(result, robot)]
-    others = (urdf, ur_kinematics, ur_calibration, camera_info, mdh, robodk)
-    if corrections and any(others) and not transmission_errors(whole):
-        without = f"Not written: {Path(corrections).name}, since the calibration has no transmission errors."
-        remarks, corrections = [without, *remarks], None
     corrected: list[tuple[str | Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, partial(_write_urdf, result, marker, robot, **frames)),
         (ur_kinematics, partial(_write_ur_kinematics, result, robot, marker)),
@@ -303,15 +299,14 @@ def _ends(arm: RobotSetup, file: Path) -> str:
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
     """Write four rows a period of the finest harmonic in the measured ranges; return what they are, and their sizes."""
     curves = transmission_errors(result)
-    if not curves:
-        accepted = "transmission errors of joints, which model 'auto' adds where the data support them"
-        raise InputError("the calibration", "no transmission error", accepted)
     lines = ["joint,angle_deg,correction_mrad,std_mrad"]
     for curve in curves:
         rows = np.column_stack([np.degrees(curve.q), 1e3 * curve.error, 1e3 * curve.standard])[curve.inside]
         lines += [f"{curve.joint},{angle:.4f},{value:.5f},{of_value:.5f}" for angle, value, of_value in rows]
-    errors = [f"{curve} {1e3 * curve.rms:.3f}" for curve in curves]
     write_text(target, "\n".join(lines) + "\n")
+    if not curves:
+        return [f"{target.name} has no rows: the calibration has no transmission errors."]
+    errors = [f"{curve} {1e3 * curve.rms:.3f}" for curve in curves]
     return [
         f"Transmission errors (RMS, mrad): {joined(errors)}. Angles are those of the controller, within the "
         "measured ranges; std_mrad is the standard uncertainty (k = 1). The actual angle is angle_deg plus the "

@@ -41,6 +41,11 @@ class Targets(NamedTuple):
     torque: Array | None  # (N, dof)
     payload: Array | None = None  # (N,)
 
+    def take(self, rows: Sequence[int] | np.ndarray) -> Targets:
+        """Return some of the rows."""
+        values = [None if each is None else each[rows] for each in self[1:]]
+        return Targets(tuple(self.label[i] for i in rows), *values)
+
 
 def read_targets(
     result: Calibration,

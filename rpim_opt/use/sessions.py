@@ -103,10 +103,7 @@ def base_frame(result: Calibration, robot: str, session: str = "") -> Array:
 
 
 def session_notes(result: Calibration, robot: str = "") -> list[str]:
-    """Return a sentence on the session of `in_session` and the base in every session; none without sessions.
-
-    With the base at B and B' in two of them, a position p' is at M p' in the other, M = B B'^-1. Its U is of p - M p'.
-    """
+    """Return a sentence on the session of `in_session` and the base in every session; none without sessions."""
     here = result.problem.session
     if not here:
         return []
@@ -114,12 +111,6 @@ def session_notes(result: Calibration, robot: str = "") -> list[str]:
     names = sorted(measured, key=lambda name: (name != here, not measured[name]))
     before = {name: "" if again else " (by rows before the update)" for name, again in measured.items()}
     listed = [f"'{n}'{before[n]} {placed(frame_numbers(base_frame(result, robot, n)))}" for n in names[:FEW]]
-    for i, name in enumerate(names[1:FEW] if not result.no_intervals else (), start=1):
-        M = base_frame(result, robot) @ np.linalg.inv(base_frame(result, robot, name))
-        there = replace(result, problem=replace(result.problem, session=name))
-        apart = result.fit_covariance.of_positions(_slopes(result, robot) - M[:3, :3] @ _slopes(there, robot))
-        U = 2e3 * np.sqrt(np.trace(apart, axis1=1, axis2=2).max())
-        listed[i] += f" (positions there relative to '{here}': U, k = 2, at most {U:.3g} mm where it was measured)"
     more = f"; {len(names) - FEW} more in the result" if len(names) > FEW else ""
     return [
         f"Positions and their U are in the instrument's frame of session '{here}'. Base of the DH table in the frame "

@@ -202,12 +202,9 @@ def test_corrections_are_a_table(rippled, tmp_path):
     assert doubtful.notes[0] in list(csv.reader((tmp_path / "arm.csv").read_text().splitlines()))[1][-1]
     assert "separate fit to the same measurements" in (tmp_path / "arm.csv").read_text()
     plain = ro.calibrate(result.stated, weight=1.0)
-    with pytest.raises(ro.InputError, match="no transmission error"):
-        ro.use.export_files(plain, corrections=tmp_path / "none.csv")
-    written, said, _ = ro.use.export_files(plain, mdh=tmp_path / "arm.csv", corrections=tmp_path / "none.csv")
-    assert [file.name for file in written] == ["arm.csv"]
-    assert said[0] == "Not written: none.csv, since the calibration has no transmission errors."
-    assert not (tmp_path / "none.csv").exists()
+    _, said, _ = ro.use.export_files(plain, mdh=tmp_path / "arm.csv", corrections=tmp_path / "none.csv")
+    assert said[-1] == "none.csv has no rows: the calibration has no transmission errors."
+    assert list(csv.reader((tmp_path / "none.csv").read_text().splitlines()))[1:] == []
 
 
 def test_corrections_count_as_the_controller_does(tmp_path):
