@@ -325,8 +325,6 @@ def _with_known(data: Dataset, table: problem_file.ProblemTable, role: str, path
             label, planar = those[-1]
             least, column = (4, "plane") if planar else (2, "point")
             if len(those) < least - (name in joined):
-                accepted = (
-                    f"{least} or more, one less where a [[known_distance]] or [[known_angle]] joins it to another"
-                )
+                accepted = f"{least} or more, one less where a known distance or angle joins it to another"
                 raise InputError(f"row {label}, column {column}", f"'{name}' touched {len(those)} times", accepted)
     return whole

@@ -119,20 +119,20 @@ def new_problem(
         raise InputError("validation", "a table and a fraction to hold out", "one of them")
     arm = read_arm(source, urdf_base, urdf_tip, dh, origins=bool(chain))
     identified, validated, seen = (f"{chain}_{name}" if chain else name for name in TABLES)
-    board = stated_target(target, seen)
+    board, stated, points = stated_target(target, seen)
     paths, later = _files(data), _files(validation or ())
     tell = understood or (lambda found: None)
     found = in_time_order(interpret_tables(arm, paths, measurement, options))
     tell(found)
     kind, how = _kind(arm, found, board, measurement)
     found = replace(found, kind=kind)
-    rows = rows_of(found, on_board(found.columns, board.board), arm, kind)
+    rows = rows_of(found, on_board(found.columns, board), arm, kind)
     held = _held_out(rows, hold_out, seed)
-    tables = {identified: _rows(found.columns, ~held), validated: _rows(found.columns, held), seen: board.table}
+    tables = {identified: _rows(found.columns, ~held), validated: _rows(found.columns, held), seen: points}
     if later:
         other = in_time_order(interpret_tables(arm, later, kind.name, found.options))
         tell(other)
-        rows_of(other, on_board(other.columns, board.board), arm, kind)
+        rows_of(other, on_board(other.columns, board), arm, kind)
         tables[validated] = other.columns
     sources = [*paths, *later]
     alike = len({file.name for file in sources}) < len(sources)
@@ -140,7 +140,7 @@ def new_problem(
     with in_file(found.file):
         text, guessed = _problem_text(
             arm, source, found, rows.take(np.flatnonzero(~held)), chain=chain, first=not before,
-            links={"urdf_base": urdf_base, "urdf_tip": urdf_tip}, target=board.stated, identification=identified,
+            links={"urdf_base": urdf_base, "urdf_tip": urdf_tip}, target=stated, identification=identified,
             columns=how, data=paths[0].name, validation=validated, held_out=held.any(), seed=seed,
             validated_by=next((file.name for file in later), ""), raw=digests,
         )  # fmt: skip
@@ -256,41 +256,34 @@ def _rows(columns: Columns, chosen: np.ndarray) -> Columns:
 # --- what was measured, and the board that a camera sees ---------------------------------------------------------
 
 
-class StatedTarget(NamedTuple):
-    """A board: its points, the value of ``target`` in a problem file, and the table to write, if any."""
+def stated_target(text: str, file: str = TABLES[-1]) -> tuple[Board, str, Columns]:
+    """Return the board of ``--target``, its line of a problem file, and the table to write if it is no grid.
 
-    board: Board
-    stated: str
-    table: Columns
-
-
-def stated_target(text: str, file: str = TABLES[-1]) -> StatedTarget:
-    """Return the board of ``--target``: a table, called ``file`` in the folder, or a grid; empty without one."""
+    That is called ``file`` in the folder. All are empty without a board.
+    """
     if not text:
-        return StatedTarget({}, "", {})
+        return {}, "", {}
     match = GRID.fullmatch(text.strip())
     if match:
         columns, rows, spacing, unit = match.groups()
         board = grid_board(int(columns), int(rows), float(spacing) * UNITS[unit].si)
-        return StatedTarget(board, f"target = {{ columns = {columns}, rows = {rows}, spacing_{unit} = {spacing} }}", {})
+        return board, f"target = {{ columns = {columns}, rows = {rows}, spacing_{unit} = {spacing} }}", {}
     if "." not in text:
         raise InputError("--target", f"'{text}'", "a table with point, x_mm, y_mm, or a grid such as 7x5,30mm")
     board = read_board(text)
     places = np.array(list(board.values())) * 1e3
     table = {"point": list(board)}
     table |= {f"{axis}_mm": [repr(float(v)) for v in column] for axis, column in zip("xyz", places.T, strict=True)}
-    return StatedTarget(board, f'target = "{file}"', table)
+    return board, f'target = "{file}"', table
 
 
-def _kind(
-    arm: RobotSetup, found: Interpretation, target: StatedTarget, measurement: str | None
-) -> tuple[Measurement, str]:
+def _kind(arm: RobotSetup, found: Interpretation, board: Board, measurement: str | None) -> tuple[Measurement, str]:
     """Return the measurement type and how it is known; refuse pixels without a board, and a board without pixels."""
     kind = found.kind
-    if target.board and not kind.by_camera:
+    if board and not kind.by_camera:
         raise InputError("--target", "a board", f"none: measurement {kind.name} uses no board", found.file)
     on_target = any(name.startswith("target_x") for name in found.columns)
-    if kind.by_camera and not target.board and not on_target:
+    if kind.by_camera and not board and not on_target:
         accepted = "--target with what the camera sees: a table with point, x_mm, y_mm, or a grid such as 7x5,30mm"
         raise InputError("the target", "nothing", accepted, found.file)
     if measurement is not None:
@@ -303,7 +296,7 @@ def _kind(
         return kind, f"guessed from the columns {', '.join(kind.columns)}"
     misfit = {}  # RMS [m] of the views' poses where base and tool fit best, camera on the flange or beside the robot
     for name, each in CAMERAS.items():
-        data = read_data(on_board(found.columns, target.board), arm.robot, {"pixel_px": 1.0}, each)
+        data = read_data(on_board(found.columns, board), arm.robot, {"pixel_px": 1.0}, each)
         poses = with_poses(data, starting_cameras(data, {}))
         base, tools, _ = locate(arm.robot, poses, {block.markers[0]: np.zeros(6) for block in poses.blocks})
         placed_so = model_parameters(arm.robot, base, tools).identify(["base_*"])

@@ -213,13 +213,12 @@ class Comparison:
             raise InputError("metric", f"'{metric}'", f"one of which less is better: {choices(metric, ranked)}")
         of = figures(self.rows, metric)
         with_figures = [method for method, values in of.items() if values]
-        if against is None and not with_figures:
-            found = f"no replicate with results; {self.rows[0]['status']}: {self.rows[0]['reason']}"
-            raise InputError("comparison", found, "one")
-        reference = with_figures[0] if against is None else against
+        reference = against or next(iter(with_figures), self.methods[0])
         other = pick(of, reference, "against")
         if not other:
-            raise InputError("against", f"'{against}', which has no results", "a method with results")
+            first = next(row for row in self.rows if row["method"] == reference)
+            found = f"'{reference}', which has no results; {first['status']}: {first['reason']}"
+            raise InputError("comparison", found, "a method with results")
         standings = []
         for method in with_figures:
             own = of[method]

@@ -296,9 +296,8 @@ def _resumed(path: Path, code: Mapping[str, str], resume: bool | None) -> dict[s
         stored = dict(json.loads(line) for line in content[: content.rfind(b"\n") + 1 or None].splitlines())
         known = dict(stored.pop("code", {}))
     except (TypeError, ValueError):
-        raise InputError(
-            "the file", "no journal of replicates", "--no-resume (resume=False) to start again", path
-        ) from None
+        accepted = "--no-resume (resume=False) to start again"
+        raise InputError("the file", "no journal of replicates", accepted, path) from None
     if not stored:
         return {}
     if resume is None:

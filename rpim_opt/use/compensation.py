@@ -324,12 +324,10 @@ def compensate(
     status[np.isin(np.arange(len(status)), outside.rows) & (status == "ok")] = "extrapolated"
     whole["status"] = tuple(status.tolist())
     if targets.q is None:
-        point += (
-            " Targets without joint values are sought in the measured joint ranges first, and may be reached in "
-            "another arm configuration: state q1, ... with them."
-        )
+        point += " Targets without joint values may be reached in another arm configuration: state q1, ... with them."
         if outside.rows:
-            point += f" No solution in these ranges was found for {listed([targets.label[i] for i in outside.rows])}."
+            beyond = listed([targets.label[i] for i in outside.rows])
+            point += f" No solution in the measured joint ranges was found for {beyond}."
     if tool is not None:
         reflector = _Cell(result, robot, arm, kind, None, cell.marker, base, targets.torque is not None)
         row = int(np.argmax(whole["std"]))

@@ -70,15 +70,15 @@ def test_a_folder_may_be_named_by_its_file() -> None:
 
 
 def test_targets_are_grids_or_tables(tmp_path: Path) -> None:
-    assert stated_target("").stated == ""
-    assert len(stated_target("7x5,30mm").board) == 35
+    assert stated_target("") == ({}, "", {})
+    assert len(stated_target("7x5,30mm")[0]) == 35
     with pytest.raises(ro.InputError, match="a grid such as 7x5,30mm"):
         stated_target("7 by 5")
     path = tmp_path / "board.csv"
     path.write_text("point,x_mm,y_mm\na,0,0\nb,30,0\nc,0,30\n")
-    found = stated_target(str(path))
-    assert found.board["b"] == pytest.approx([0.03, 0.0, 0.0])
-    assert found.table["point"] == ["a", "b", "c"]
+    board, _, points = stated_target(str(path))
+    assert board["b"] == pytest.approx([0.03, 0.0, 0.0])
+    assert points["point"] == ["a", "b", "c"]
 
 
 # --- results -------------------------------------------------------------------------------------------------------

@@ -112,7 +112,7 @@ def test_without_validation_data_a_row_says_so() -> None:
     found = ro.compare(POSITION.problem, selectors=1.0, progress=False)
     assert found.rows[0]["status"] == "impossible"
     assert "no validation data" in found.rows[0]["reason"]
-    with pytest.raises(ro.InputError, match="no replicate with results; impossible: splits: found no validation data"):
+    with pytest.raises(ro.InputError, match="which has no results; impossible: splits: found no validation data"):
         found.summary()
 
 

@@ -401,9 +401,9 @@ def test_poses_are_reached_in_the_measured_joint_ranges_where_that_can_be() -> N
     inside = np.random.default_rng(4).uniform(0.95 * low, 0.95 * high, (25, 6))
     found = ro.use.compensate(result, poses=nominal_poses(result, inside))
     assert not found.outside.rows
-    assert "No solution in these ranges" not in found.point
+    assert "No solution in the measured joint ranges" not in found.point
     far = nominal_poses(result, np.array([[0.5, -0.3, high[2] + 0.6, 0.2, 0.4, 0.1]]))  # an elbow bent further
-    assert "No solution in these ranges was found for 1." in ro.use.compensate(result, poses=far).point
+    assert "No solution in the measured joint ranges was found for 1." in ro.use.compensate(result, poses=far).point
 
 
 @pytest.mark.slow
