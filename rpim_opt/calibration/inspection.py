@@ -65,7 +65,7 @@ class Inspection(Tabled):
     @property
     def outliers(self) -> tuple[ExcludedRow, ...]:
         """Rows that the quick fit excluded."""
-        return () if self.fit is None or self.fit.learned is None else tuple(self.fit.learned.left_out)
+        return () if self.fit is None else self.fit.left_out
 
     def _short(self) -> str:
         o = self.observability

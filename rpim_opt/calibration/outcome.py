@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, choices
 from rpim_opt.basics.text import joined, three_digits
-from rpim_opt.bayes.hyperparameters import Learned, sessions_log_std
+from rpim_opt.bayes.hyperparameters import ExcludedRow, Learned, sessions_log_std
 from rpim_opt.bayes.outliers import by_block, coherent, contradicted, error_vectors
 from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration import diagnosis
@@ -495,6 +495,11 @@ class Outcome:
         sure = contradicted(model, program.penalty_form, weight, default_widths(free) / free.scale, groups)
         return tuple(flag for flag, certain in zip(flags, sure, strict=True) if certain)
 
+    @property
+    def left_out(self) -> tuple[ExcludedRow, ...]:
+        """The outliers that were excluded before the fit."""
+        return () if self.learned is None else self.learned.left_out
+
     @cached_property
     def clustered(self) -> tuple[str, ...]:
         """Labels of flagged rows whose errors are correlated with those of neighbours in joint space or time.
@@ -517,8 +522,7 @@ class Outcome:
     @property
     def outliers(self) -> list[str]:
         """Labels of all outliers: excluded before the fit, and flagged after it."""
-        before = () if self.learned is None else self.learned.left_out
-        return [row.label for row in (*before, *self.flagged)]
+        return [row.label for row in (*self.left_out, *self.flagged)]
 
     def without_flagged(self) -> Self:
         """Return the calibration without the flagged rows, with the same formulation, selector and solver.

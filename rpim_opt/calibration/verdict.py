@@ -169,9 +169,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     reasons = [] if result.converged else [result.message]
     kept = kept_rows(result)
     reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result)]
-    out = set(np.array(result.problem.labels)[~kept].tolist())
-    if result.learned is not None:
-        out |= {row.label for row in result.learned.left_out}
+    out = {*np.array(result.problem.labels)[~kept].tolist(), *(row.label for row in result.left_out)}
     rows = len(out.union(result.problem.labels))
     if len(out) > EXCLUDED * rows:
         reasons.append(f"{len(out)} of {rows} rows are outliers, more than {EXCLUDED:.0%}.")
@@ -519,8 +517,7 @@ def likely_causes(result: Outcome) -> list[str]:
     head = [f"{BAD}: {'; '.join(signs)}."] if signs else []
     ordered = in_table_order(problem, result.excluded, result.record.validation)
     shared = [*shared_rows(problem.data, result.record.validation), *copied_rows(problem.data)]
-    left_out = () if result.learned is None else result.learned.left_out
-    together = list(left_out_together(problem.labels, {row.label for row in left_out}))
+    together = list(left_out_together(problem.labels, {row.label for row in result.left_out}))
     if result.mapping is not None:
         shared += result.mapping.ambiguities
     if known:

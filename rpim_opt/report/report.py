@@ -87,7 +87,7 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     if lacking is not None and lacking.alarming:  # said at the top; otherwise it is a diagnosis
         warnings = [" ".join(composition), *warnings]
         composition = []
-    left_out = [] if result.learned is None else [str(row) for row in result.learned.left_out]
+    left_out = [str(row) for row in result.left_out]
     if left_out:
         warnings.append(f"Excluded outliers: {counted(len(left_out), 'row')}, {listed(left_out)}.")
     accepted = None if result.record.requirement is None else accept(result)
@@ -351,7 +351,7 @@ def _diagnostics(content: Content) -> Iterator[Block]:
     if len(flagged) > MOST_FLAGGED:
         rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{status}; result.json names them"])
     rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]
-    for row in () if result.learned is None else result.learned.left_out:
+    for row in result.left_out:
         if row.label not in result.record.excluded:
             error = in_unit(row.error, row.dimension)
             rows.append([row.label, "", error, f"excluded outlier, {row.ratio:.0f} times the median error"])

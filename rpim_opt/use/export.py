@@ -240,7 +240,7 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
 
     learned, penalty = result.learned, result.formulation.penalty
     selected, added = ((), ()) if learned is None else (learned.extensions, learned.added)
-    left_out = set() if learned is None else {row.label for row in learned.left_out}
+    left_out = {row.label for row in result.left_out}
     lost = [each for each in selected if each not in CONDITIONS]
     lost += [name for name, value in beyond.items() if value and name not in added]
     if penalty is None or getattr(penalty, "maker", "") != prior_penalty.__name__:
@@ -251,7 +251,7 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
             where = f"formulation '{result.formulation.name}'"
             found = f"no fit without {listed(lost, 6)}, which files cannot hold: {str(error).rstrip('.')}"
             raise InputError(where, found, "functions that do not use them") from error
-        if isinstance(stated, CalibrationProblem) and alone.learned is not None and alone.learned.left_out:
+        if isinstance(stated, CalibrationProblem) and alone.learned is not None and alone.left_out:
             again = calibrate(alone.problem.on(stated.data), alone.formulation, weight=alone.weight)
             alone = replace(again, learned=replace(alone.learned, left_out=()))
     else:  # a prior of all its parameters, in units of their scales: as it is, with what is beyond geometry at zero
