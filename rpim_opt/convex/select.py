@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from importlib import import_module
-from inspect import signature
 from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any
@@ -74,11 +73,5 @@ def weight_of(stated: Any) -> Any:
     InputError for a name that no selector has.
     """
     if not isinstance(stated, str):
-        if callable(stated):
-            with contextlib.suppress(ValueError):  # what has no signature is called as it is
-                try:
-                    signature(stated).bind(None)
-                except TypeError as error:
-                    raise InputError("weight", f"a selector with {error}", "one argument, the `Program`") from None
         return stated
     return None if stated == LEARNED else pick(SELECTORS, stated, "weight", also=f"a number, a selector, {LEARNED}, ")

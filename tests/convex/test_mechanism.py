@@ -126,7 +126,7 @@ def test_every_minimum_is_that_of_plain_cvxpy(loss: str, penalty: str, constrain
         pytest.skip("plain CVXPY does not solve it in any of five ways")
 
 
-@pytest.mark.parametrize("loss", ["absolute", "quantile", "insensitive", "sum of norms"])
+@pytest.mark.parametrize("loss", ["absolute", "quantile", "insensitive", "sum of norms", "minimax"])
 def test_kinks_of_many_rows_are_those_of_all_rows_in_one_program(monkeypatch: pytest.MonkeyPatch, loss: str) -> None:
     """From 400 entries on the loss is smoothed, and only rows near a non-smooth point are taken as they are."""
     problem, _ = simulated(configurations=500, noise=1e-4, seed=3)
