@@ -62,4 +62,5 @@ def read_arm(
     if convention:
         accepted = "a table of numbers; other files state their convention"
         raise InputError("--dh", f"'{convention}' of {file.name}", accepted)
-    return RobotSetup(read_robot(file))
+    robot = read_robot(file)
+    return RobotSetup(robot, names=tuple(robot.joint_names[k] for k in robot.leading if robot.joint_names))

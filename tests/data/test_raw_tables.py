@@ -19,6 +19,7 @@ from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import together
 from rpim_opt.data.tables.understanding import CanonicalTable, interpret
+from rpim_opt.robot.library import read_arm
 from rpim_opt.store.raw import interpret_tables
 
 ARM = ro.robot.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
@@ -397,12 +398,25 @@ def test_no_value_of_a_sheet_is_under_another_header_where_columns_are_empty(
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(("places", "meant"), [("AAABBBCCC", True), ("AAAAAAAAA", True), ("ABCDEFGHA", False)])
-def test_a_station_of_several_poses_is_a_session(tmp_path: Path, places: str, meant: bool) -> None:
-    rows = "".join(f"{place},{i},2,401,5,{i}\n" for i, place in enumerate(places))
+@pytest.mark.parametrize(
+    ("places", "poses", "meant"), [("AAABBBCCC", 9, 1), ("AAAAAAAAA", 9, 1), ("AAABBBCCC", 3, 1), ("ABCDEFGHA", 9, 0)]
+)
+def test_a_station_of_several_poses_is_a_session(tmp_path: Path, places: str, poses: int, meant: int) -> None:
+    """Also where the same poses were measured from each."""
+    rows = "".join(f"{place},{i % poses},2,401,5,{i}\n" for i, place in enumerate(places))
     for head in ("Station", "Aufstellung"):
         columns = read(write(tmp_path, HEAD.replace("Point", head) + rows)).columns
         assert list(columns.get("session", ())) == list(places) * meant
+
+
+def test_joints_are_called_as_a_robot_table_names_them(tmp_path: Path) -> None:
+    """A1 turns the arm on a track, E1, whatever A1 is elsewhere."""
+    robot = replace(ARM, joint_types=("prismatic", "revolute"), joint_names=("E1", "A1"))
+    ro.robot.write_robot(robot, tmp_path / "robot.toml")
+    arm = read_arm(tmp_path / "robot.toml")
+    path = write(tmp_path, "Satz;E1 [mm];A1 [deg];X [mm];Y [mm];Z [mm]\nP1;1;2;401;5;6\nP2;3;4;402;6;7\n")
+    columns = interpret_tables(arm, [path]).columns
+    assert list(columns) == ["label", "q1_mm", "q2_deg", "x_mm", "y_mm", "z_mm"]
 
 
 @pytest.mark.parametrize("targets", [True, False])

@@ -204,7 +204,7 @@ def _name_sessions(read: Meanings, table: Columns) -> None:
     places = [name for name, each in read.items() if each.stem == "station" and all(map(str, table[name]))]
     joints = [table[name] for name, each in read.items() if re.fullmatch(r"q\d+", each.stem)]
     if len(places) == 1 and "session" not in {each.stem for each in read.values()}:
-        poses = {*zip(*joints, strict=True)} or range(len(table[places[0]]))
+        poses = {*zip(table[places[0]], *joints, strict=True)} if joints else table[places[0]]
         count = len({*table[places[0]]})
         if count == 1 or len(poses) >= PLACED * count:
             read[places[0]] = Meaning("session", "", "where the instrument stood")
