@@ -132,10 +132,9 @@ def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None
         return f"Not delivered: do not use this robot before the points below are resolved. {sentence}"
     held = result.record.held_out
     if held is not None and name == "held out":
-        sentence += (
-            f" This validates the procedure with parameters from {held.used} rows; the delivered parameters are "
-            f"from all {len(result.problem.labels)}."
-        )
+        every = len(result.problem.labels)
+        sentence += f" This validates the procedure with parameters from {held.used} rows; "
+        sentence += f"the delivered parameters are from all {every}."
         excluded = excluded_by_fit(result)
         if excluded:
             sentence += f" Not counted: held-out rows {listed(excluded)}, excluded from the fit to all rows."

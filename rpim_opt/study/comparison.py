@@ -261,11 +261,10 @@ class Comparison:
             *(f"{name}: {what}" for name, what in self.asked.items()),
         ])  # fmt: skip
         replicates = csv_text(self.rows[0], (row.values() for row in self.rows))
-        where = ", ".join(self.problems) if len(self.problems) <= 3 else f"{len(self.problems)} problems"
         ratios = {each.method: each.ratio for each in summary.standings if each.ratio is not None}
         report = studies.Report(text, ratios, {"comparison": self.plot()})
         made = "\n\n".join(f"{name}: {what}" for name, what in self.made.items())
-        title = f"{len(self.methods)} methods on {where}"
+        title = f"{counted(len(self.methods), 'method')} on {counted(len(self.problems), 'problem')}"
         studies.write(Path(folder), title, report, made, {"replicates.csv": replicates.encode()})
         return Path(folder) / "README.md"
 

@@ -351,21 +351,13 @@ def _write_urdf(
     notes = []
     frame = "the instrument's frame" + (result.problem.session and f" of session '{result.problem.session}'")
     if base is not None:
-        notes.append(
-            f"URDF: {root} is {frame}: the identified base, {placed(base)} in it, is in the first joint's origin, so "
-            f"that {root} needs no other pose."
-        )
+        notes.append(f"URDF: {root} is {frame}: the identified base, {placed(base)}, is in the first joint's origin.")
     elif of_base or of_session:
         at = placed(frame_numbers(numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))))
-        notes.append(
-            f"URDF: {root} is at {at} in {frame}. Use this pose with the corrected origins, not an earlier one."
-        )
+        notes.append(f"URDF: {root} is at {at} in {frame}: use this pose, not an earlier one.")
     if tool is not None:
         moved = 1e3 * np.linalg.norm(tool[:3] - own.tool[:3])
-        notes.append(
-            f"URDF: {tip} moved by {moved:.3g} mm to the identified reflector, {placed(tool)} in the DH table's flange "
-            f"frame: whatever refers to {tip} moves with it."
-        )
+        notes.append(f"URDF: {tip} moved by {moved:.3g} mm to the reflector, {placed(tool)} in the flange frame.")
     elif of_tool:
         at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
         there = f"in its frame the reflector is at {at}; --tip-measured (tip_measured=True) moves it there"
@@ -435,14 +427,9 @@ def _write_ur_calibration(result: Calibration, robot: str, marker: str | None, s
     mdh[0, :2] = 0.0
     notes += write_ur_calibration(source, replace(arm.robot, mdh=mdh), catalogued, target)
     if b"joint_checksum" in read_bytes(source):
-        notes.append(
-            "joint_checksum is copied from the source: its algorithm is not published, so a controller may refuse "
-            "the file. Keep the original."
-        )
+        notes.append("joint_checksum is that of the source: a controller may refuse the file. Keep the original.")
     if not np.array_equal(mdh, arm.robot.mdh):
-        notes.append(
-            "The tilt and offset of axis 1 (alpha1, a1) are left out: the Base of calibration.conf is on axis 1."
-        )
+        notes.append("Without the tilt and offset of axis 1 (alpha1, a1): the Base of calibration.conf is on it.")
     return [*notes, _of_controller(replace(arm, base=frame_numbers(numeric_frame(arm.base) @ axis)))]
 
 

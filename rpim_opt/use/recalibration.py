@@ -78,10 +78,8 @@ class Moved(NamedTuple):
     std: float
 
     def __str__(self) -> str:
-        figures = self.content()
-        return (
-            f"{self.name} {figures['change']:+.4g} {printed(figures['unit'])} (standard deviation {figures['std']:.2g})"
-        )
+        of = self.content()
+        return f"{self.name} {of['change']:+.4g} {printed(of['unit'])} (standard deviation {of['std']:.2g})"
 
     def content(self) -> dict[str, Any]:
         """Return it as a document [mm, deg]."""

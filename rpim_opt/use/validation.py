@@ -80,7 +80,6 @@ class Validation(HeldOut):
             "remarks": self.remarks,
             "mistake": self.mistake,
             "worse": bool(self.worse),
-            "judged": bool(np.isfinite(self.sigmas).any()),
             "rows": records(self._rows()),
         }
 
