@@ -131,10 +131,8 @@ def _require_names(header: Sequence[Any]) -> None:
     if len(header) > WIDEST:
         raise InputError("the header", f"{len(header)} columns", f"at most {WIDEST}")
     for name in header:
-        if not isinstance(name, str):
-            raise InputError("the header", f"column {name!r}", "unique strings as names")
-        if not name:
-            raise InputError("the header", "a column without a name", accepted)
+        if not isinstance(name, str) or not name:
+            raise InputError("the header", f"column {name!r}", accepted)
         if header.count(name) > 1:
             raise InputError("the header", f"column '{name[:40]}' twice", accepted)
 
@@ -510,12 +508,8 @@ def columns_csv(columns: Mapping[str, Sequence[Any]], exact: Collection[str] = (
 
 def _with_apostrophe(cell: Any) -> Any:
     """Return a cell that no spreadsheet takes for a formula; numbers may have a sign."""
-    if not isinstance(cell, str) or not FORMULA.match(cell):
-        return cell
-    with contextlib.suppress(ValueError):
-        float(cell)
-        return cell
-    return f"'{cell}"
+    formula = isinstance(cell, str) and FORMULA.match(cell) and math.isnan(numeral(cell))
+    return f"'{cell}" if formula else cell
 
 
 def frame_of(rows: Sequence[dict[str, Any]]) -> Any:

@@ -153,10 +153,7 @@ class _Penalty(Ready):
         L, c = np.vstack([L, np.reshape(rows, (-1, n))]), np.concatenate([c, values])
         if len(L) == n and not np.any(L - np.diag(np.diag(L))):
             return Quadratic(np.diag(L).copy(), c)
-        if len(L) <= n:
-            return Quadratic(L, c)
-        R: Any = np.linalg.qr(np.column_stack([L, c]), mode="r")
-        return Quadratic(R[:n, :n], R[:n, n], float(R[n, n] ** 2))
+        return Quadratic(L, c)
 
 
 # --- statements -----------------------------------------------------------------------------------------------

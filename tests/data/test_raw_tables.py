@@ -337,7 +337,7 @@ def test_files_below_each_other_are_in_the_units_of_the_first(tmp_path: Path) ->
 
 
 def test_a_table_without_columns_and_one_whose_names_are_no_texts() -> None:
-    for table, said in (({}, "an empty table"), ({1: [2]}, "column 1, accepted: unique strings as names")):
+    for table, said in (({}, "an empty table"), ({1: [2]}, "column 1, accepted: a unique name for every column")):
         with pytest.raises(ro.InputError, match=said):
             ro.read_data(table, ARM, {"position_mm": 0.1})
 

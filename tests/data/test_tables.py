@@ -75,7 +75,7 @@ HOSTILE = {
     "short row": (GOOD + "c,1,2,3\n", "row 3 (c): found 4 cells, accepted: 6"),
     "long row": (GOOD + "c,1,2,3,4,5,6\n", "row 3 (c): found 7 cells, accepted: 6"),
     "no header": (ROW + "b,2,3,4,5,6\n", "the header: found"),
-    "unnamed column": (GOOD.replace("x_mm", ""), "the header: found a column without a name"),
+    "unnamed column": (GOOD.replace("x_mm", ""), "the header: found column '', accepted: a unique name"),
     "column twice": (GOOD.replace("y_mm", "x_mm"), "the header: found column 'x_mm' twice"),
     "column in two units": (f"{HEAD},x_m\na,1,2,3,4,5,6\n", "column 'x' in two units"),
     "a driver's header": (GOOD.replace("x_mm", "/tracker/point/x"), "rpim-opt new (ro.store.new_problem)"),
