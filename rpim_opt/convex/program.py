@@ -23,7 +23,7 @@ from rpim_opt.convex.robust_loss import Inliers, inliers_of
 from rpim_opt.convex.solvers.conic import FEASIBLE, Damping, Point, Unsolved, nearest
 from rpim_opt.convex.solvers.separable import Rows
 from rpim_opt.convex.solvers.solve import WarmStart, minimum
-from rpim_opt.convex.structure import Structure, structure
+from rpim_opt.convex.structure import TIGHT, Structure, structure
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
 ACTIVE = 1e-7
@@ -346,8 +346,10 @@ class Program(Brief):
         """
         begin = time.perf_counter()
         weight = self._weight(weight)
-        if solver or settings or verbose or self.structure.joint:
+        if solver or settings or verbose:
             estimate = self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
+        elif self.structure.joint:
+            estimate = self._by_cvxpy(weight, damping, cp.CLARABEL, TIGHT, False)
         elif weight == 0 and not self.linear_penalty:  # what multiplies zero is no part of the program
             alone = self._part(self.structure.without_penalty, self.model).solve(damping=damping)
             estimate = replace(alone, penalty=self.value(alone.z, 0.0)[1])

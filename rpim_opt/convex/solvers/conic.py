@@ -35,6 +35,13 @@ ATTEMPTS: tuple[Attempt, ...] = (
     (("static_regularization_constant", 1e-7), ("equilibrate_enable", True)),  # unknowns of 1e4 prior scales
 )
 """What is tried in turn: where one factorization stalls, another does not."""
+EQUILIBRATED: Attempt = (
+    ("equilibrate_enable", True),
+    ("tol_gap_abs", SOUGHT),
+    ("tol_gap_rel", SOUGHT),
+    ("tol_feas", 0.1 * SOUGHT),  # relative to the largest residual, an outlier's perhaps
+)
+"""Settings for the rows of a loss, which come as they are: a quarter fewer iterations."""
 REFINED: Attempt = (
     ("static_regularization_constant", 1e-12),
     ("iterative_refinement_max_iter", 20),
@@ -226,7 +233,7 @@ def _settings(attempt: Attempt) -> Any:
     settings.presolve_enable = False
     settings.chordal_decomposition_merge_method = "parent_child"  # the default takes longer than to solve
     settings.equilibrate_enable = False  # rows and columns are scaled already: a quarter fewer iterations
-    if not attempt:  # up to ten take half of the time; a point is judged by its true residuals
+    if attempt in ((), EQUILIBRATED):  # up to ten take half of the time; a point is judged by its true residuals
         settings.iterative_refinement_max_iter = 1
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = ACCEPTED if attempt else SOUGHT
     settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = ACCEPTED
@@ -523,7 +530,8 @@ class _ConicData:
         self.P, place = _assembled(curvature, (size, size))
         self._curvature = self.P.data.copy()
         self.own, self._weighted = dense[1][2], place[: len(curvature[0][0])]
-        self.clarabel = Clarabel(cones)
+        # a loss's rows come as the user scaled them
+        self.clarabel = Clarabel(cones, ATTEMPTS if loss is None else (EQUILIBRATED, *ATTEMPTS))
 
     def linked(self, r: Array) -> Array:
         """Return the bounds of the loss's rows, for a residual r (m,) of the equations."""
