@@ -13,6 +13,7 @@ from rpim_opt.basics.arrays import TINY, Array, rms
 from rpim_opt.basics.exceptions import InputError, NotDelivered
 from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.basics.units import fits
+from rpim_opt.bayes.empirical_bayes import OUTLIER_SEARCHES
 from rpim_opt.calibration.diagnosis import flagged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import held_out_errors, unregistered
@@ -751,13 +752,21 @@ def _without_outliers(
     errors, own = ordered.errors(result.x), np.isin(ordered.labels, list(kept))
     largest = np.nan_to_num(errors[own]).max()
     alone = ordered.on(ordered.data.take(np.flatnonzero(own | (errors <= largest))))
-    return alone, ridge_deviations(alone) if again and result.single else result.x
+    if not again or not result.single:
+        return alone, result.x
+    x = ridge_deviations(alone)
+    for _ in range(OUTLIER_SEARCHES):  # they hide behind each other, and make others look like some
+        before, alone = alone, ordered.without({flag.label for flag in flagged(ordered, x)})
+        if alone.labels == before.labels:
+            break
+        x = ridge_deviations(alone)
+    return alone, x
 
 
 def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Iterator[str]:
     """Say that outliers make a loss fit badly what it fits without them, else what other residuals show."""
     alone, x = _without_outliers(result, ordered)
-    single = [flag.label for flag in result.single]
+    single = sorted(set(result.problem.labels).difference(alone.labels), key=result.problem.labels.index)
     ratio, before = _worst_ratio(alone, x), _worst_ratio(ordered if result.squared_loss else alone, result.x)
     loss = "a squared loss" if result.squared_loss else "this loss"
     if single and ratio <= min(NOISY, MOVED**0.5 * before):

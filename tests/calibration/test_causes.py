@@ -853,6 +853,28 @@ def test_an_outlier_of_a_squared_loss_is_no_moved_base(row: int) -> None:
     assert not any("base" in cause for cause in result.causes)
 
 
+@pytest.mark.parametrize("largest", [3e-3, 8e-3])
+def test_outliers_that_hide_behind_larger_ones_are_named_and_no_others(largest: float) -> None:
+    """Without the two that a fit flags it is still bent: the third hides, and a good row looks like one."""
+    problem = ro.load("position").problem
+    block = problem.data.blocks[0]
+    y = block.y.copy()
+    for row, size in zip((4, 20, 33), (largest, largest, largest / 3), strict=True):
+        y[row] += size * np.array([0.48, 0.6, -0.64])
+    result = ro.calibrate(problem.on(replace(problem.data, blocks=(replace(block, y=y),))), ro.tikhonov, weight=1.0)
+    (text,) = result.verdict.reasons
+    assert text.startswith("Likely: outliers (c4, c20, c33): without them residuals are 0.")
+
+
+def test_measurements_that_nothing_explains_are_read_with_any_coupling() -> None:
+    """Of a joint that moves two of the table one more coupling may move the same two, which no robot has."""
+    mdh = np.array([[0, 0, 0, 0.3, 0], [1.5, 0.1, 0, 0, 0], [0, 0.4, 0, 0, 0]])
+    arm = ro.robot.Robot("follower", mdh, joint_map=np.array([[1, 0], [1, 1], [0, 0]]))
+    rng = np.random.default_rng(0)
+    data = ro.Dataset.of(rng.uniform(-1, 1, (8, 2)), rng.normal(size=(8, 3)), 1e-4)
+    assert better_interpretation(ro.problem_from(arm, data)) is None
+
+
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("weight", [0.5, "reml"])
 def test_gross_errors_under_a_squared_loss_are_outliers_and_no_backlash(robot: str, weight) -> None:

@@ -202,6 +202,8 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
     for (i, j), factor in product(sorted({*coupled} - own), (-1, 0, 1)):
         to_model = robot.joint_map.copy()
         to_model[i, j] = factor
+        if np.linalg.matrix_rank(to_model) < robot.dof:  # another coupling already moves the same joints
+            continue
         what = f"joint {numbered(i, robot.joint_names)} following joint {robot.joint(j)} {factor} times"
         yield _with_robot(what, coupling(to_model), replace(robot, joint_map=to_model))
 
