@@ -293,9 +293,9 @@ class Program(Brief):
     def problem(self, weight: float) -> cp.Problem:
         """Return the program as a CVXPY problem in the variable ``z``: what it minimizes is what `solve` minimizes.
 
-        ``A``, ``b`` and ``weight`` are parameters of those names (`cp.Problem.param_dict`), parameters of the
-        formulation's functions have the values with which it was posed. InputError for a weight that is negative or not
-        finite.
+        ``A``, ``b`` and ``weight`` are parameters of those names (`cp.Problem.param_dict`), and so are the parameters
+        of the formulation's own functions; it obeys CVXPY's rules for parametrized programs (DPP). InputError for a
+        weight that is negative or not finite.
         """
         A, b = self.rows
         data = (
@@ -303,20 +303,26 @@ class Program(Brief):
             cp.Parameter(b.shape, name="b", value=b),
             cp.Parameter(nonneg=True, name="weight", value=self._weight(weight)),
         )
-        return self._written(data, None)[0]
+        return self._written(data, self.structure.expressions.live, None)[0]
 
-    def _written(self, data: tuple[Any, Any, Any], damping: Damping | None) -> Any:
+    def _written(self, data: tuple[Any, Any, Any], stated: tuple[Any, Any, Any], damping: Damping | None) -> Any:
         """Return a CVXPY problem, its variable z, and the formulation's constraints by function."""
         shape, expressions = self.structure, self.structure.expressions
+        loss, penalty, groups = stated
         A, b, weight = data
         z, r = cp.Variable(shape.n, name="z"), cp.Variable(shape.equations, name="r")
         instead = {id(expressions.z): z, id(expressions.r): r}
-        groups = [[substituted(constraint, instead) for constraint in group] for group in expressions.constraints]
+        groups = [[substituted(constraint, instead) for constraint in group] for group in groups]
         every = [r == A @ z - b]
         every += [constraint for group in groups for constraint in group]
-        total = substituted(shape.loss_of_r, instead) + self.model.offset
-        if expressions.penalty_of_z is not None:
-            total = total + weight * substituted(expressions.penalty_of_z, instead)
+        total = substituted(shape.of_r(loss), instead) + self.model.offset
+        if penalty is not None:
+            price = substituted(penalty, instead)
+            if price.parameters():  # a parameter times a parameter would not be DPP
+                above = cp.Variable(name="penalty")
+                every.append(above >= price)
+                price = above
+            total = total + weight * price
         if damping is not None:
             total = total + cp.sum_squares(damping.F @ (z - damping.centre))
         return cp.Problem(cp.Minimize(total), every), z, groups
@@ -530,7 +536,7 @@ class Program(Brief):
         if not isinstance(solver, str) or solver.upper() not in cp.installed_solvers():
             installed = ", ".join(cp.installed_solvers())
             raise InputError("solver", f"{solver!r}", f"an installed solver: {installed}")
-        problem, z, groups = self._written((*self.rows, weight), damping)
+        problem, z, groups = self._written((*self.rows, weight), self.structure.expressions.stated, damping)
         for variable in problem.variables():
             variable.save_value(None)
         with warnings.catch_warnings():

@@ -57,7 +57,8 @@ class Expressions:
     """Expressions that a formulation's functions return, with private copies of the user's parameters and variables.
 
     ``loss`` and ``penalty`` are of what they get (residuals or norms, z or norms of groups), ``penalty_of_z`` and
-    ``constraints``, one list for every function, of z.
+    ``constraints``, one list for every function, of z; ``stated`` are loss, penalty and constraints, ``live`` these
+    with the user's own parameters.
     """
 
     def __init__(self, formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray):
@@ -83,21 +84,22 @@ class Expressions:
             which = np.repeat(np.arange(len(self.differences)), [len(D) for D in self.differences])
             instead = {id(penalized): norms(np.vstack(self.differences) @ z, which)}
         frozen = Frozen([z, r, argument, penalized], where)
-        loss = scalar(called(formulation.loss, f"{where}, loss", argument), f"{where}, loss")
-        self.loss = Term(frozen(loss), argument)
+        live_loss = scalar(called(formulation.loss, f"{where}, loss", argument), f"{where}, loss")
+        self.loss = Term(frozen(live_loss), argument)
+        live_penalty: Any = None
         self.penalty: Any = None
         self.penalty_of_z: Any = None
         if formulation.penalty is not None:
             stated = scalar(called(formulation.penalty, f"{where}, penalty", penalized), f"{where}, penalty")
             self.penalty = Term(frozen(stated), penalized)
-            self.penalty_of_z = self.penalty.expression
-            if instead:
-                self.penalty_of_z = substituted(self.penalty.expression, instead)
+            live_penalty, self.penalty_of_z = (
+                substituted(each, instead) if instead else each for each in (stated, self.penalty.expression)
+            )
         known = arguments_of(z, parameters)
-        self.constraints: list[list[Any]] = []
+        live = []
         for k, constraint in enumerate(formulation.constraints):
             of = f"{where}, {name_of(constraint, k)}"
-            self.constraints.append([frozen(each) for each in listed(called(constraint, of, z, known), of)])
+            live.append(listed(called(constraint, of, z, known), of))
         composed = {"penalty": self.penalty_of_z} if instead and self.penalty is not None else {}
         if argument is not r:  # norms are convex and nonnegative, as absolute values are
             composed["loss"] = substituted(self.loss.expression, {id(argument): cp.abs(cp.Variable(argument.size))})
@@ -105,8 +107,11 @@ class Expressions:
             if not expression.is_convex():
                 accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
                 raise InputError(f"{where}, {what}", "a program that is not convex", accepted)
+        self.constraints = [[frozen(each) for each in group] for group in live]
         self.flat = [constraint for group in self.constraints for constraint in group]
         self.own = {variable.id for variable in frozen.own}
+        self.stated: tuple[Any, ...] = (self.loss.expression, self.penalty_of_z, self.constraints)
+        self.live: tuple[Any, ...] = (live_loss, live_penalty, live)
         self.predicts = bool(known.asked)
 
     def owned(self, *stated: Any) -> set[int]:
@@ -183,11 +188,10 @@ class Structure:
         """Whether the loss gets the configurations' norms."""
         return self.formulation.loss_over == "configuration"
 
-    @property
-    def loss_of_r(self) -> Any:
-        """The loss as an expression of r."""
-        loss, r = self.expressions.loss, self.expressions.r
-        return substituted(loss.expression, {id(loss.variable): norms(r, self.groups)} if self.over_norms else {})
+    def of_r(self, stated: Any) -> Any:
+        """Return an expression of the loss's argument as one of r."""
+        argument, r = self.expressions.loss.variable, self.expressions.r
+        return stated if argument is r else substituted(stated, {id(argument): norms(r, self.groups)})
 
     @cached_property
     def on_squares(self) -> Structure:
@@ -197,6 +201,8 @@ class Structure:
             own = made._called
             own.r = cp.Variable(self.n + 1, name="r")
             own.loss = Term(cp.sum_squares(own.r), own.r)
+            own.stated = (own.loss.expression, *own.stated[1:])
+            own.live = (own.loss.expression, *own.live[1:])
         made.formulation = replace(self.formulation, loss=SQUARES, loss_over="equation")
         made.equations = self.n + 1
         return made
@@ -206,7 +212,9 @@ class Structure:
         """The same loss and constraints without the penalty."""
         made = self._changed("penalty_form", "canonical")
         if made._called is not None:
-            made._called.penalty = made._called.penalty_of_z = None
+            own = made._called
+            own.penalty = own.penalty_of_z = None
+            own.stated, own.live = ((loss, None, groups) for loss, _, groups in (own.stated, own.live))
         made.formulation = replace(self.formulation, penalty=None)
         return made
 
