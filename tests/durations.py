@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 FILE = Path(__file__).with_name("cases.toml")
-MOST, LONGEST = 0.6, 1.0
+MOST, LONGEST = 0.5, 0.9
 """Processor time [s] of all cases of a test, and of a test without cases, that the default suite spends."""
 HEAD = """\
 # Number of cases that the default suite runs of a test that takes long, spread over all of them; the others are slow.

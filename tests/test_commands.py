@@ -169,7 +169,7 @@ def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cel
     export = ("export", "arm/results", "--urdf", str(cell / "arm.urdf"), "--out")
     capsys.readouterr()
     assert run(monkeypatch, *export, "corrected.urdf", "--tip-measured") == 0
-    assert " mm to the identified reflector" in Path("corrected.urdf").read_text()
+    assert " mm to the reflector, " in Path("corrected.urdf").read_text()
     stated = re.search(r"\(k = 2.*: smr ([\d.]+) mm and ([\d.]+) mrad", capsys.readouterr().out)
     assert stated
     stated_place, stated_turn = map(float, stated.groups())

@@ -508,8 +508,12 @@ def columns_csv(columns: Mapping[str, Sequence[Any]], exact: Collection[str] = (
 
 def _with_apostrophe(cell: Any) -> Any:
     """Return a cell that no spreadsheet takes for a formula; numbers may have a sign."""
-    formula = isinstance(cell, str) and FORMULA.match(cell) and math.isnan(numeral(cell))
-    return f"'{cell}" if formula else cell
+    if not isinstance(cell, str) or not FORMULA.match(cell):
+        return cell
+    with contextlib.suppress(ValueError):
+        float(cell)
+        return cell
+    return f"'{cell}"
 
 
 def frame_of(rows: Sequence[dict[str, Any]]) -> Any:

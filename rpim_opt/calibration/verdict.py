@@ -766,7 +766,8 @@ def _without_outliers(
 def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Iterator[str]:
     """Say that outliers make a loss fit badly what it fits without them, else what other residuals show."""
     alone, x = _without_outliers(result, ordered)
-    single = sorted(set(result.problem.labels).difference(alone.labels), key=result.problem.labels.index)
+    out = set(result.problem.labels).difference(alone.labels)
+    single = [flag.label for flag in flagged(ordered, x) if flag.label in out]
     ratio, before = _worst_ratio(alone, x), _worst_ratio(ordered if result.squared_loss else alone, result.x)
     loss = "a squared loss" if result.squared_loss else "this loss"
     if single and ratio <= min(NOISY, MOVED**0.5 * before):

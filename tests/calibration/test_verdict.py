@@ -385,7 +385,7 @@ def test_outliers_are_the_cause_where_the_same_rows_without_them_fit_a_loss_of_o
     wrong = values(lambda y: y + errors)
     result = ro.calibrate(wrong(ro.load("position").problem), replace(lopsided, penalty=cp.sum_squares), 1.0)
     (reason,) = result.verdict.reasons
-    assert reason.startswith("Likely: outliers (c7, c3): without them residuals are 0.8")
+    assert reason.startswith("Likely: outliers (c3, c7): without them residuals are 0.8")
     assert "They bias this loss: use formulation 'robust'" in reason
 
 

@@ -167,7 +167,7 @@ def test_a_third_place_is_no_change_of_the_robot_and_says_nothing_of_it_before_i
         ro.use.monitor(result, data)
     judged = replace(result, record=replace(result.record, validation=data)).verdict
     assert f"Held-out rows do not fit. {found.no_intervals}" in judged.reasons
-    with pytest.raises(ro.InputError, match="accepted: no --reset: a new session is registered by itself"):
+    with pytest.raises(ro.InputError, match="accepted: no reset: a new session is registered by itself"):
         ro.use.update(result, data, reset=["base_*"])
     updated = ro.use.update(result, data)
     assert not updated.changed
