@@ -178,9 +178,9 @@ def _accuracy(content: Content) -> Iterator[Block]:
         lines = [text for text in found.sentences()[1:] if text not in said]
         if found.workspace is not None:
             units = joint_columns(result.problem.robot.joint_dimensions)
-            values = [f"{value / si:.1f}" for value, si in zip(found.workspace.q[-1], units.values(), strict=True)]
-            named = " and ".join(sorted({name.rpartition("_")[2] for name in units}))
-            lines.append(f"The maximum U is at joints {', '.join(values)} {named}.")
+            worst = zip(found.workspace.q[-1], units.items(), strict=True)
+            values = [f"{value / si:.1f} {name.rpartition('_')[2]}" for value, (name, si) in worst]
+            lines.append(f"The maximum U is at joints {', '.join(values)}.")
         yield "bullets", lines
     yield "heading", "Accuracy"
     used = "Parameters are identified from the identification rows alone."

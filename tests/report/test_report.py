@@ -324,7 +324,7 @@ def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) 
     assert words.count("Missing: more measurements.") == (verdict != "Accepted")
     assert "A. <b>Person</b>" in words
     assert not read.all("b")
-    assert "The maximum U is at joints" in words
+    assert re.search(r"The maximum U is at joints (-?[\d.]+ deg, ){5}-?[\d.]+ deg\.", words)
     assert ("[mm], above the limit in red" in "".join(read.charts())) == (verdict != "Accepted")
 
 

@@ -436,7 +436,8 @@ def _under_our_names(
             raise InputError("the header", f"columns '{other}' and '{name}' for {new}", accepted)
         columns[new] = cells
         words_of_column = kind.words.columns.get(stem) or meaning(stem)
-        meant.append(Column(name, words_of_column, new, unit, f"{reason}; unit {why}" if why else reason))
+        reasons = filter(None, [reason, why and f"unit {why}"])
+        meant.append(Column(name, words_of_column, new, unit, "; ".join(reasons)))
     unitless = {each.column: dimensions[each.name][0] for each in meant if dimensions.get(each.name)}
     if unitless:
         units_of = [
