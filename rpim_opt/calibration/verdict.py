@@ -755,7 +755,7 @@ def _without_outliers(
     if not again or not result.single:
         return alone, result.x
     x = ridge_deviations(alone)
-    for _ in range(OUTLIER_SEARCHES):  # they hide behind each other, and make others look like some
+    for _ in range(OUTLIER_SEARCHES):  # they hide behind each other, and make good rows look like outliers
         before, alone = alone, ordered.without({flag.label for flag in flagged(ordered, x)})
         if alone.labels == before.labels:
             break

@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
@@ -20,11 +21,11 @@ from rpim_opt.convex.expressions import OPTIMAL, cp, substituted
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
 from rpim_opt.convex.robust_loss import Inliers, inliers_of
-from rpim_opt.convex.solvers.conic import FEASIBLE, Damping, Point, Unsolved, nearest
+from rpim_opt.convex.solvers.conic import FEASIBLE, Damping, Point, Unsolved, nearest, triangular_solution
 from rpim_opt.convex.solvers.separable import Rows
 from rpim_opt.convex.solvers.solve import WarmStart, minimum
 from rpim_opt.convex.structure import TIGHT, Structure, structure
-from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
+from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, reduced_rows
 
 ACTIVE = 1e-7
 """Part of the largest multiplier from which a constraint is active."""
@@ -32,6 +33,8 @@ TOUCHING = 1e-9
 """Distance from a bound, in scales, at which a component counts as lying on it."""
 SOFTEST = 1e-8
 """Part of the objective that counts as the least curvature where the weight is smaller."""
+WELL_CONDITIONED = 1e-6
+"""Reciprocal condition number above which a triangular factor is solved with."""
 PROXIMAL = 1e-2, 1e-4, 1e-6
 """Sizes of the proximal term after the first."""
 STATUS = {
@@ -41,6 +44,8 @@ STATUS = {
     "AlmostDualInfeasible": "unbounded",
 }
 """CVXPY's words for Clarabel's."""
+
+TRCON: Any = get_lapack_funcs("trcon", dtype=float)
 
 
 def feasibility_tolerance(z: Array) -> float:
@@ -112,6 +117,7 @@ class Program(Brief):
     model: LinearModel
     structure: Structure
     _warm: WarmStart  # shared with all programs that `on` makes of this
+    _values: dict[Any, tuple[float, float]] = field(default_factory=dict, init=False)  # loops ask for a point again
 
     def __reduce__(self) -> Any:
         return pose, (self.formulation, self.model)  # what CVXPY made of the functions does not travel
@@ -213,9 +219,12 @@ class Program(Brief):
 
         z is (n,) in units of the scales; the weight matters to variables of the functions' own alone.
         """
-        A, b = self.rows
-        loss, penalty = self.structure.values(z, A @ z - b, weight)
-        return loss + self.model.offset, penalty
+        key = z.tobytes(), weight if self.structure.inner else 0.0
+        if key not in self._values:
+            A, b = self.rows
+            loss, penalty = self.structure.values(z, A @ z - b, weight)
+            self._values[key] = loss + self.model.offset, penalty
+        return self._values[key]
 
     def objective(self, z: Array, weight: float) -> float:
         """Return loss(A z - b) + weight penalty(z); infinite outside their domain. Arguments as for `value`."""
@@ -368,13 +377,18 @@ class Program(Brief):
         return replace(estimate, seconds=time.perf_counter() - begin)
 
     def _closed(self, weight: float) -> Array:
-        """Return the minimum (n,) of squares and a quadratic penalty by the ridge formula, with rounding corrected."""
+        """Return the minimum (n,) of squares and a quadratic penalty, by QR unless it is ill-conditioned."""
         n, form, rows = self.structure.n, self.penalty_form, self.squared.qr_factor
         if form is not None and weight > 0:
             rows = np.vstack([rows, np.sqrt(weight) * np.column_stack([form.matrix, form.c])])
+        T = reduced_rows(rows)
+        if TRCON(T[:n, :n])[0] > WELL_CONDITIONED:
+            return triangular_solution(T[:n, :n], T[:n, n])
         z = self.ridge.minima(np.array([weight]))[0]
-        # a penalty that hardly holds some directions costs the formula digits
-        return z + np.linalg.lstsq(rows[:, :n], rows[:, n] - rows[:, :n] @ z, rcond=RANK_TOLERANCE)[0]
+        if form is not None and weight > 0 and not (form.diagonal and (form.L == 1).all()):
+            # a penalty that hardly holds some directions costs the formula digits
+            z = z + np.linalg.lstsq(rows[:, :n], rows[:, n] - rows[:, :n] @ z, rcond=RANK_TOLERANCE)[0]
+        return z
 
     @one_blas_thread
     def path(self, weights: Sequence[float] | Array) -> list[Estimate]:

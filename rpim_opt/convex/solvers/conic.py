@@ -64,6 +64,11 @@ CENTRED = 1e-10
 """Least weight of |z|^2, relative to the squares, of the point about which Clarabel's unknowns are counted."""
 FAR, REFINEMENTS = 1e3, 3
 """Size of a change from which a minimum is refined, and how often that is tried."""
+LARGE = 1e-2
+"""Part of the largest residual from which the objective is scaled down: no scale costs accuracy where it is small, and
+iterations where it is large."""
+DEAR = 1e6
+"""Costs beside a loss from which they are scaled down."""
 MOST_ACTIVE_SETS = 40
 """Active sets that are tried before Clarabel is asked for one."""
 
@@ -423,10 +428,13 @@ class ReducedProgram:
         if self.rows and not near.any():
             rows = np.vstack([squares.R, np.sqrt(weight + CENTRED * np.sum(squares.R**2)) * np.eye(n)])
             near[p.at] = np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0]
-        found = self._about(near, squares, weight, A, b)
-        missed = p.missed(found.x)
-        if missed > ACCEPTED or np.abs(found.x).max() > FAR:
-            found = self._nearby(found.x, max(FEASIBLE, missed), squares, weight, A, b) or found
+        far = np.abs(near).max() > FAR
+        found = self._nearby(near, FEASIBLE, squares, weight, A, b) if far else None
+        if found is None:
+            found = self._about(near, squares, weight, A, b)
+            missed = p.missed(found.x)
+            if missed > ACCEPTED or np.abs(found.x).max() > FAR:
+                found = self._nearby(found.x, max(FEASIBLE, missed), squares, weight, A, b) or found
         self.near = found.x
         return found
 
@@ -479,7 +487,9 @@ class ReducedProgram:
             bounds.append(data.linked(A @ z0 - b))
             dense.append(-A.ravel())
         cost = np.concatenate(q)
-        scale = 1.0 / max(1.0, np.abs(cost).max(), 1e-2 * np.abs(residual).max(initial=0.0))  # tolerances are absolute
+        # tolerances are absolute below one; a loss, which is no smaller, takes fewer iterations as it is
+        largest = max(np.abs(cost).max(), 1e-3 * weight, LARGE * np.abs(residual).max(initial=0.0))
+        scale = 1.0 / max(1.0, largest if self.loss is None else largest / DEAR)
         P, matrix = data.filled(weight, np.concatenate(dense))
         P.data *= scale
         solution = data.clarabel.solve(P, cost * scale, matrix, np.concatenate(bounds))

@@ -27,7 +27,7 @@ INEXACT = 1e-7
 STEPS = 60
 """Newton steps of one smoothing width."""
 FEW_ENTRIES = 400
-"""Entries of a non-smooth loss up to which Clarabel takes them all as they are, which is quicker."""
+"""Entries of a loss up to which Clarabel takes them all as they are, where that is quicker."""
 NEAR = 6
 """Times the number of parameters: rows near a non-smooth point that are taken as they are."""
 SMOOTHED = 0.02
@@ -360,6 +360,7 @@ class Loss:
 
     def __init__(self, expression: Any, variable: Any, positive: bool):
         self.expression, self.variable, self.positive = expression, variable, positive
+        self.piecewise_quadratic = bool(expression.is_qpwa())
         self.entries: Any = None
         self.largest = type(expression).__name__ == "max"
         if {v.id for v in expression.variables()} == {variable.id}:

@@ -61,8 +61,9 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
 
     ============================ ===================================================
     quadratic                    the small program of its QR factor
+    separable, few entries       all rows in Clarabel, where that is quicker
     separable, smooth            proximal Newton, a sequence of small programs
-    separable, non-smooth        the same on the smoothed loss, then rows where it bends; few entries in Clarabel
+    separable, non-smooth        the same on the smoothed loss, then rows where it bends
     a largest entry              those entries that are the largest on the way
     any other                    all rows in Clarabel
     ============================ ===================================================
@@ -90,12 +91,19 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
 
 
 def _by_newton(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
+    few = loss.variable.size <= FEW_ENTRIES
+    # piecewise linear: one program of all rows; piecewise quadratic: the same where Newton's first small programs would
+    # need cones, too, or begin with an unknown active set
+    begun = warm.z is not None
+    quick = begun or (warm.canonical.polyhedral and warm.canonical.size == len(warm.canonical.at))
+    if few and (loss.expression.is_pwl() or (loss.piecewise_quadratic and not quick)):
+        return _all_rows(loss, rows, warm, weight, damping)
     if warm.jump < 0:
         warm.jump = loss.slope_jump(rows)
-    if warm.jump and loss.variable.size <= FEW_ENTRIES:
+    if few and warm.jump:
         return _all_rows(loss, rows, warm, weight, damping)
     small = warm.program(rows.A.shape[1] + 1)
-    z, x, begun = warm.z, warm.x, warm.z is not None
+    z, x = warm.z, warm.x
     if z is None or x is None:
         x = small.solve(rows.squares.damped(damping), weight).x
         z = x[warm.canonical.at]
