@@ -247,8 +247,10 @@ def test_where_a_path_begins_changes_nothing(loss: str) -> None:
     [
         (LOSSES["tail"]["loss"], "equation"),
         pytest.param(cp.max, "configuration", marks=pytest.mark.slow),
-        (lambda r: cp.sum_largest(cp.abs(r), 40), "equation"),
-        (lambda r: cp.max(cp.multiply(np.linspace(1, 2, r.size), cp.abs(r))), "equation"),
+        (lambda r: 3 * cp.sum_largest(cp.abs(r), 40), "equation"),
+        (lambda r: cp.sum_largest(cp.abs(r), 12.5), "equation"),
+        (lambda r: 10 * cp.max(cp.multiply(np.linspace(1, 2, r.size), cp.abs(r))) / 3, "equation"),
+        (lambda r: cp.norm(r, "inf") + 1.0, "equation"),
     ],
 )
 def test_some_rows_of_many_give_the_minimum_of_all(loss: Any, over: str) -> None:

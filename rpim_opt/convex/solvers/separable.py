@@ -355,17 +355,20 @@ def gram(A: Array, weights: Array) -> Array:
 class Loss:
     """A loss f(v) that is not quadratic, of residuals v (M,), or where ``positive`` of configurations' norms.
 
-    Where it is ``separable``, f(v) = sum_i f_i(v_i), where it is the ``largest`` entry, f(v) = max_i f_i(v_i).
+    Where it is ``separable``, f(v) = sum_i f_i(v_i); else, where ``entries`` are known, the sum of so many of the
+    ``largest`` f_i(v_i): one of minimax, k of a CVaR.
     """
 
     def __init__(self, expression: Any, variable: Any, positive: bool):
         self.expression, self.variable, self.positive = expression, variable, positive
         self.piecewise_quadratic = bool(expression.is_qpwa())
         self.entries: Any = None
-        self.largest = type(expression).__name__ == "max"
+        self.largest = 0.0
         if {v.id for v in expression.variables()} == {variable.id}:
-            whole = expression.args[0] if self.largest else None
-            self.entries = _summands(expression, variable) if whole is None else _checked(whole, variable)
+            self.entries = _entries(expression, variable, SUMS)
+            if self.entries is None:
+                self.largest = _count(expression, variable)
+                self.entries = _entries(expression, variable, LARGEST)
 
     @property
     def separable(self) -> bool:
@@ -400,10 +403,14 @@ class Loss:
         return self.slope(v), np.maximum((high - low) / (2 * apart), 0.0)
 
     def some(self, which: np.ndarray) -> Canonical:
-        """Return the sum of some entries (k,), or the largest of them, in canonical form."""
+        """Return the sum of some entries (k,), or of the largest of them, in canonical form."""
         own = cp.Variable(len(which))
         entries = _restricted(self.entries, self.variable, own, which)
-        return Canonical(cp.max(entries) if self.largest else cp.sum(entries), [], own)
+        return Canonical(cp.sum_largest(entries, self.largest) if self.largest else cp.sum(entries), [], own)
+
+    def total(self, values: Array) -> float:
+        """Return the sum of the largest f_i(v_i) of some (k,)."""
+        return float(np.asarray(cp.sum_largest(values, self.largest).value))
 
     def slope_jump(self, rows: Rows) -> float:
         """Return the largest jump of the slope by residuals of usual size, or where norms are zero; 0 for none."""
@@ -436,23 +443,31 @@ class Loss:
 # --- the expression tree -----------------------------------------------------------------------------------------
 
 
-def _summands(e: Any, v: Any) -> Any:
-    """Return the entrywise expression (M,) whose sum a scalar expression is, up to what v does not change, or None."""
+SUMS: dict[str, Any] = {"Sum": lambda a: a, "norm1": cp.abs, "quad_over_lin": cp.square}
+LARGEST: dict[str, Any] = {"max": lambda a: a, "sum_largest": lambda a: a, "norm_inf": cp.abs}
+
+
+def _entries(e: Any, v: Any, atoms: dict[str, Any]) -> Any:
+    """Return the entrywise expression (M,) that a scalar one sums, all entries or the largest, or None.
+
+    ``atoms`` are SUMS or LARGEST; what v does not change is left out.
+    """
     name = type(e).__name__
     if e.size != 1 or not has(e, v):
         return None
-    if name in ("Sum", "norm1", "quad_over_lin"):
-        entries = {"Sum": lambda a: a, "norm1": cp.abs, "quad_over_lin": cp.square}[name](e.args[0])
+    if name in atoms:
+        entries = atoms[name](e.args[0])
         if name == "quad_over_lin" and e.args[1].is_constant():
             entries = entries / e.args[1]
         return _checked(entries, v)
-    parts = [_summands(a, v) if has(a, v) else a for a in e.args]
-    if name == "MulExpression" and parts[0] is e.args[0] and v.shape == e.args[1].shape:  # weights @ entries
-        return _checked(cp.multiply(cp.reshape(e.args[0], v.shape, order="C"), e.args[1]), v)
+    parts = [_entries(a, v, atoms) if has(a, v) else a for a in e.args]
+    if name == "MulExpression" and parts[0] is e.args[0] and v.shape == e.args[1].shape and atoms is SUMS:
+        return _checked(cp.multiply(cp.reshape(e.args[0], v.shape, order="C"), e.args[1]), v)  # weights @ entries
     if any(part is None for part in parts):
         return None
-    if name == "AddExpression":
-        return sum(part for part, a in zip(parts, e.args, strict=True) if part is not a)
+    changed = [part for part, a in zip(parts, e.args, strict=True) if part is not a]
+    if name == "AddExpression" and (atoms is SUMS or len(changed) == 1):
+        return sum(changed)
     if name in ("multiply", "MulExpression"):
         return cp.multiply(*parts)
     if name in ("NegExpression", "DivExpression"):
@@ -460,6 +475,14 @@ def _summands(e: Any, v: Any) -> Any:
     if name == "reshape":
         return parts[0]
     return None
+
+
+def _count(e: Any, v: Any) -> float:
+    """Return how many of the largest entries a scalar expression sums."""
+    for a in e.args:
+        if a.size == 1 and has(a, v):
+            return _count(a, v)
+    return float(getattr(e, "k", 1.0))
 
 
 def _checked(entries: Any, v: Any) -> Any:

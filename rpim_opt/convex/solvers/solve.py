@@ -64,7 +64,7 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
     separable, few entries       all rows in Clarabel, where that is quicker
     separable, smooth            proximal Newton, a sequence of small programs
     separable, non-smooth        the same on the smoothed loss, then rows where it bends
-    a largest entry              those entries that are the largest on the way
+    the largest entries          those entries that are the largest on the way
     any other                    all rows in Clarabel
     ============================ ===================================================
 
@@ -134,9 +134,9 @@ def _all_rows(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: D
 
 
 def _by_largest(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
-    """Return the minimum of a largest entry (minimax) by a working set; of other losses all rows are taken.
+    """Return the minimum of the largest entries (minimax, CVaR) by a working set; of other losses all rows are taken.
 
-    The largest of some entries bounds that of all from below; those that are above it then are added.
+    The largest of some entries bound those of all from below; those that are above them then are added.
     """
     n, at = rows.A.shape[1], warm.canonical.at
     if loss.variable.size <= FEW_ENTRIES or loss.entries is None:
@@ -149,15 +149,15 @@ def _by_largest(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping:
     values = loss.values(rows.entries(rows.A @ z - rows.b))
     for _ in range(GENERATIONS):
         if small is None or small.rows != len(terms.y):
-            working = np.union1d(working, np.argsort(-values)[: 4 * n])
+            working = np.union1d(working, np.argsort(-values)[: 4 * n + int(loss.largest)])
             small = rows.program(loss, working, warm.canonical, len(terms.y))
         try:
             point = small.solve(terms, weight, *rows.equations(working))
         except Unsolved:  # some entries alone may be unbounded
             break
         values = loss.values(rows.entries(rows.A @ point.x[at] - rows.b))
-        most = values[working].max()
-        if values.max() - most <= GAP * max(abs(most), 1.0):
+        most = loss.total(values[working])
+        if loss.total(values) - most <= GAP * max(abs(most), 1.0):
             warm.part = working, small
             return point
         small = None
