@@ -40,22 +40,27 @@ EXCEL_ROWS = 2**20
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": " "}
 """What may stand between cells, by name; a space stands for any number of them."""
 SAMPLE = 2**15  # characters from which the separator is found
-TEXTS = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", ".xyz", ".pts", ".md", ".html", ".htm", ".xls")
+TEXTS = (".csv", ".txt", ".tsv", ".dat", ".log", ".asc", ".xyz", ".pts", ".md", ".html", ".htm", ".xls", ".xml")
 EXCEL = (".xlsx", ".xlsm", ".ods")
-EXCEL_97, ZIPPED = b"\xd0\xcf\x11\xe0", b"PK\x03\x04"  # how workbooks begin, old ones and those of today
+EXCEL_97, EXCEL_2003, ZIPPED = b"\xd0\xcf\x11\xe0", b"microsoft-com:office:spreadsheet", b"PK\x03\x04"
+"""What workbooks begin with: old ones, those in XML, and those of today."""
 BORDERS = str.maketrans("│┃║", "|||")  # lines between the columns of printed tables
 NUMBERS_OF_ROW = 3  # numbers in a row from which on a sheet is one of measurements
-NUMERAL = re.compile(r"(?!\d+([.,])(?:\d\d?|\d{4,})\1)[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")  # no 31.05.2026
-NO_NUMBER = re.compile(
-    r"(?<=\d)['\u2019\u00a0\u202f](?=\d{3}(?!\d))|±(?=\s*\d)|(?<=\d)[ \t]+#[^\n,;|\t]*$", re.MULTILINE
-)
-"""Signs between thousands that are no decimal marks, that before an uncertainty, and a comment behind a row."""
+NUMERAL = re.compile(
+    r"(?!\d+([.,])(?:\d\d?|\d{4,})\1)[+-]?(?:\d+(?:[.,]\d+)*[.,]?|[.,]\d+)(?:[eE][+-]?\d+)?"
+)  # no 31.05.2026
+NO_NUMBER = re.compile(r"(?<=\d)['\u2019\u00a0\u202f](?=\d{3}(?!\d))|(?<=\d)[ \t]+#[^\n,;|\t]*$", re.MULTILINE)
+"""Signs between thousands that are no decimal marks, and a comment behind a row."""
+EITHER_SIGN = re.compile(r"±\s*(?=\d)")  # before an uncertainty, or the limits of a joint
 FORTRAN = re.compile(r"(?<=\d)[dD](?=[+-]\d)")
 """The sign of an exponent of double precision, 0.15D+01."""
 SEXAGESIMAL = re.compile(r"(\d+)°\s*(\d+)['\u2032]\s*(\d+(?:[.,]\d+)?)(?:\"|\u2033|'')")
 """Degrees, minutes and seconds."""
-CELL = re.compile(r"(?i)<(?:t[hd]|table:[a-z-]*cell)\b([^<>]*)>([^<]*(?:<(?!/?t(?:[hdr]|able|body|foot)\b)[^<]*)*)")
-"""What an HTML page or an OpenDocument sheet states of a cell, and what is in it."""
+CELL = re.compile(
+    r"(?i)<(?:t[hd]|table:[a-z-]*cell|(?:ss:)?cell)\b([^<>]*)>([^<]*(?:<(?!/?(?:t(?:[hdr]|able|body|foot)|(?:ss:)?cell)\b)[^<]*)*)"
+)
+"""What an HTML page or a sheet in XML states of a cell, and what is in it."""
+NAMED_SHEET = re.compile(r'<(?:table:table|(?:ss:)?Worksheet)\s[^<>]*(?:table:n|ss:N)ame="([^"]*)')
 FOREIGN = re.compile(rb"[\x80-\xff]{4,}")
 """So many letters beyond ASCII follow each other in no Western European word."""
 NO_AXIS = re.compile(r"9E\+?0?9", re.IGNORECASE)  # what RAPID writes for an axis that is not there
@@ -212,17 +217,22 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
     """Return the rows of a text or Excel file; arguments as in `TableOptions`."""
     require_file(path, LARGEST_DATA, (*TEXTS, *EXCEL))
     with path.open("rb") as stream:
-        begins = stream.read(len(ZIPPED))
-    if begins == EXCEL_97:
+        begins = stream.read(1024)
+    if begins.startswith(EXCEL_97):
         raise InputError("the file", "a workbook of Excel 97 to 2003", "one that was saved as .xlsx")
-    if path.suffix.lower() in EXCEL or (path.suffix.lower() == ".xls" and begins == ZIPPED):
+    zipped = path.suffix.lower() == ".xls" and begins.startswith(ZIPPED)
+    if path.suffix.lower() in EXCEL or zipped or EXCEL_2003 in begins:
         return _excel(path, sheet)
     if sheet:
         raise InputError("--sheet", f"'{sheet}' of a text file", "an Excel workbook")
     whole, notes = decoded(path, encoding)
+    if path.suffix.lower() == ".xml":
+        raise InputError("the file's name", f"'{path.name}'", "a table, or a workbook that Excel saved as XML")
     if whole.lstrip().startswith("<"):
         whole = "\n".join("\t".join(_cells_of_page(row)) for row in re.split(r"(?i)<tr\b", whole)[1:])
-    text = FORTRAN.sub("e", NO_NUMBER.sub("", SEXAGESIMAL.sub(_decimal, whole.translate(BORDERS))))
+    text = FORTRAN.sub(
+        "e", NO_NUMBER.sub("", EITHER_SIGN.sub("+", SEXAGESIMAL.sub(_decimal, whole.translate(BORDERS))))
+    )
     mark = SEPARATORS.get(separator, separator.replace("\\t", "\t")) if separator else _separator(text)
     if len(mark) != 1:
         raise InputError("--separator", f"'{separator}'", choices(separator, SEPARATORS))
@@ -233,15 +243,20 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
     return Grid(*_split(text, mark), notes, mark)
 
 
-def _cells_of_page(row: str) -> Iterator[str]:
-    """Yield the cells of a row of an HTML table or of an OpenDocument sheet, where a number is not as it is shown."""
+def _cells_of_page(row: str) -> list[str]:
+    """Return the cells of a row of an HTML table or of a sheet in XML, where a number is not as it is shown."""
+    cells: list[str] = []
     for stated, inside in CELL.findall(row):
+        place = re.search(r'ss:Index="(\d{1,4})"', stated)  # those before it are left out
+        cells += [""] * (int(place[1]) - 1 - len(cells) if place else 0)
         value = re.search(r'office:value="([^"]*)', stated)
         cell = value[1] if value else " ".join(unescape(re.sub(r"<[^>]*>", " ", inside)).split())
-        yield cell
-        span = re.search(r"(colspan|columns-repeated)\W+(\d{1,2})\b", stated, re.IGNORECASE)
+        cells.append(cell)
+        span = re.search(r"(colspan|columns-repeated|MergeAcross)\W+(\d{1,2})\b", stated, re.IGNORECASE)
         if span:
-            yield from repeat(cell if span[1] == "columns-repeated" else "", int(span[2]) - 1)
+            further = int(span[2]) - (span[1] != "MergeAcross")
+            cells += [cell if span[1] == "columns-repeated" else ""] * further
+    return cells
 
 
 def _decimal(angle: re.Match[str]) -> str:
@@ -383,7 +398,7 @@ def _excel(path: Path, sheet: str) -> Grid:
     chosen = ""
     try:
         with path.open("rb") as stream:
-            sheets = _sheets(stream)
+            sheets = _sheets(path, stream)
             names = list(sheets)
             known = {str(i): name for i, name in enumerate(names, start=1)} | {name: name for name in names}
             for named in [pick(known, sheet, "--sheet")] if sheet else names:
@@ -402,25 +417,32 @@ def _excel(path: Path, sheet: str) -> Grid:
     return Grid([row for _, row in rows], [number for number, _ in rows], notes)
 
 
-def _sheets(stream: BinaryIO) -> dict[str, Iterable[Iterable[Any]]]:
+def _sheets(path: Path, stream: BinaryIO) -> dict[str, Iterable[Iterable[Any]]]:
     """Return the rows of the sheets of a workbook by their names."""
+    if EXCEL_2003 in stream.read(1024):
+        return _sheets_in_xml(decoded(path)[0])
     with ZipFile(stream) as archive:  # what it says of itself is what is read of it
         size = sum(entry.file_size for entry in archive.infolist())
         if size > LARGEST_WORKBOOK:
             raise InputError("the file", f"{size} bytes unpacked", f"{LARGEST_WORKBOOK}, or more as .csv or .parquet")
         if "content.xml" in archive.namelist():  # OpenDocument
-            named = re.split(r"<table:table\s[^<>]*table:name=\"([^\"]*)", archive.read("content.xml").decode())[1:]
-            return dict(zip(map(unescape, named[::2]), map(_rows_of_sheet, named[1::2]), strict=True))
+            return _sheets_in_xml(archive.read("content.xml").decode())
     book = library("openpyxl", "Excel files").load_workbook(stream, read_only=True, data_only=True)
     for sheet in book.worksheets:
         sheet.reset_dimensions()  # what the file says of them would fill every row up
     return {sheet.title: sheet.iter_rows(values_only=True) for sheet in book.worksheets}
 
 
+def _sheets_in_xml(text: str) -> dict[str, Iterable[Iterable[Any]]]:
+    """Return the rows of the sheets of an OpenDocument or Excel 2003 file by their names."""
+    named = NAMED_SHEET.split(text)[1:]
+    return dict(zip(map(unescape, named[::2]), map(_rows_of_sheet, named[1::2]), strict=True))
+
+
 def _rows_of_sheet(sheet: str) -> Iterator[list[str]]:
-    """Yield the rows of an OpenDocument sheet; what it states once for equal rows as often as they are there."""
-    for row in re.split(r"<table:table-row\b", sheet)[1:]:
-        cells = list(_cells_of_page(row))
+    """Yield the rows of a sheet in XML; what it states once for equal rows as often as they are there."""
+    for row in re.split(r"<(?:table:table-row|(?:ss:)?Row)\b", sheet)[1:]:
+        cells = _cells_of_page(row)
         times = re.match(r'[^<>]*number-rows-repeated="(\d{1,7})"', row)
         yield from repeat(cells, int(times[1]) if times and any(cells) else 1)
 

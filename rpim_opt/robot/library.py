@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import inside, require_file
@@ -44,9 +46,17 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
 
 
 def read_arm(
-    file: Path, urdf_base: str | None = None, urdf_tip: str | None = None, convention: str = "", origins: bool = False
+    file: Path,
+    urdf_base: str | None = None,
+    urdf_tip: str | None = None,
+    convention: str = "",
+    origins: bool = False,
+    units: Mapping[str, str] = MappingProxyType({}),
 ) -> RobotSetup:
-    """Return the robot of a file, with base and tool if a URDF or a standard DH table states them."""
+    """Return the robot of a file, with base and tool if a URDF or a standard DH table states them.
+
+    A table has ``units`` as `TableOptions` where it states none.
+    """
     if file.suffix == ".urdf":
         from rpim_opt.robot.formats.urdf import read_urdf
 
@@ -54,7 +64,7 @@ def read_arm(
     if origins:
         raise InputError("chain", f"a robot {file.name}", "a robot in a file .urdf")
     if file.suffix in SHEETS:
-        return read_sheet(file, convention)
+        return read_sheet(file, convention, units)
     if file.suffix in (".yaml", ".yml"):
         from rpim_opt.robot.formats.universal_robots import read_ur_kinematics
 

@@ -117,7 +117,8 @@ def new_problem(
     chain = chain or branching_tip(source, urdf_base, urdf_tip)
     if validation and hold_out is not None:
         raise InputError("validation", "a table and a fraction to hold out", "one of them")
-    arm = read_arm(source, urdf_base, urdf_tip, dh, origins=bool(chain))
+    options = options or TableOptions()
+    arm = read_arm(source, urdf_base, urdf_tip, dh, origins=bool(chain), units=options.units)
     identified, validated, seen = (f"{chain}_{name}" if chain else name for name in TABLES)
     board, stated, points = stated_target(target, seen)
     paths, later = _files(data), _files(validation or ())

@@ -442,6 +442,51 @@ def test_messages_that_ros_prints_into_a_text_are_read_and_xml_is_named(tmp_path
         read(write(tmp_path, "<?xml version='1.0'?><a/>", "m.xml"))
 
 
+@pytest.mark.parametrize("name", ["raw.xls", "raw.xml"])
+def test_a_workbook_that_excel_2003_saved_as_xml_is_read_by_its_content(tmp_path: Path, name: str) -> None:
+    """Cells that are left out, and those behind merged ones, are at their places; a sheet is chosen by its numbers."""
+
+    def row(*cells: str) -> str:
+        return "<Row>" + "".join(cells) + "</Row>"
+
+    def cell(text: str, stated: str = "", kind: str = "String") -> str:
+        return f'<Cell{stated}><Data ss:Type="{kind}">{text}</Data></Cell>'
+
+    numbers = [cell(text, kind="Number") for text in ("10", "20.5", "1", "2", "3e0")]
+    rows = row(cell("Joints [deg]", ' ss:Index="2" ss:MergeAcross="1"'), cell("Tracker [mm]", ' ss:MergeAcross="2"'))
+    rows += row(*map(cell, ["Point", "J1 [deg]", "J2 [deg]", "X [mm]", "Y [mm]", "Z [mm]"]))
+    rows += row(cell("P1"), *numbers) + row('<Cell ss:StyleID="s1"/>', *numbers)
+    rows += row(cell("11", ' ss:Index="2"', "Number"), *numbers[1:])
+    sheets = [f'<Worksheet ss:Name="{title}"><Table>{own}</Table></Worksheet>'
+              for title, own in (("Notes", row(cell("cell 4"))), ("A &amp; B", rows))]  # fmt: skip
+    head = '<?xml version="1.0"?>\n<?mso-application progid="Excel.Sheet"?>\n'
+    head += '<Workbook xmlns="urn:schemas-microsoft-com:office:spreadsheet" xmlns:ss="urn:schemas-microsoft-com:office:'
+    path = write(tmp_path, f'{head}spreadsheet">{"".join(sheets)}</Workbook>', name)
+    assert [row[:3] for row in read_grid(path).rows[2:]] == [
+        ["P1", "10", "20.5"],
+        ["", "10", "20.5"],
+        ["", "11", "20.5"],
+    ]
+    found = read(path)
+    assert found.columns["q2_deg"] == ["20.5"] * 3
+    assert found.columns["z_mm"] == ["3e0"] * 3
+    assert any("'A & B' of Notes, A & B" in note for note in found.notes)
+
+
+def test_three_readings_side_by_side_are_rows_of_one_configuration(tmp_path: Path) -> None:
+    """Those of several reflectors, which differ by more, are still refused."""
+    head = "Point,J1 [deg],J2 [deg],X1 [mm],Y1 [mm],Z1 [mm],X2 [mm],Y2 [mm],Z2 [mm]\n"
+    rows = "A,1,2,401,5,6,401.1,5,6\nB,3,4,402,96,7,402,96.2,7\nC,5,4,302,96,7,302,96.2,7\n"
+    found = read(write(tmp_path, head + rows))
+    assert found.columns["label"] == ["A/1", "A/2", "B/1", "B/2", "C/1", "C/2"]
+    assert found.columns["x_mm"] == ["401", "401.1", "402", "402", "302", "302"]
+    assert found.columns["q1_deg"] == ["1", "1", "3", "3", "5", "5"]
+    data = ro.read_data(found.columns, ARM, {"position_mm": 0.05})
+    assert data.configuration.tolist() == [0, 0, 1, 1, 2, 2]
+    with pytest.raises(ro.InputError, match="another point or reading"):
+        read(write(tmp_path, head + rows.replace("401.1", "421.1")))
+
+
 def test_equal_rows_of_a_spreadsheet_are_as_many_as_they_were(tmp_path: Path) -> None:
     """OpenDocument states equal rows once, with their number; empty ones to the end of the sheet too."""
 

@@ -204,6 +204,30 @@ def test_an_angle_without_a_unit_is_in_that_of_the_others(tmp_path: Path, header
         assert "column 'theta' states no unit: rad, as the other angles are." in arm.notes
 
 
+def test_units_that_no_header_states_are_those_of_the_option(tmp_path: Path) -> None:
+    path = tmp_path / "dh.csv"
+    path.write_text("alpha,a,theta,d\n0,0,0,0.4\n-1.2,0.3,0,0\n", encoding="utf-8")
+    with pytest.raises(ro.InputError, match=r"'alpha' without a unit, accepted: .* or units deg,mm or rad,m"):
+        read_arm(path, convention="modified")
+    arm = read_arm(path, convention="modified", units={"angle": "rad", "length": "m"})
+    assert arm.robot.mdh[1, :2].tolist() == [-1.2, 0.3]
+    assert "column 'a' states no unit: m by --units." in arm.notes
+    path.write_text("alpha [deg],a [mm],theta [deg],d [mm]\n-90,0.3,0,0\n", encoding="utf-8")
+    arm = read_arm(path, convention="modified", units={"angle": "rad", "length": "m"})
+    assert arm.robot.mdh[0, :2] == pytest.approx([-np.pi / 2, 0.0003])
+
+
+@pytest.mark.parametrize(
+    "cell", ["±170", "-170..170", "-170/+170", "-170 to 170", "± 170°", "-170°…170°", "-170 - 170"]
+)
+def test_both_limits_may_be_in_a_cell(tmp_path: Path, cell: str) -> None:
+    path = tmp_path / "dh.csv"
+    path.write_text(f"alpha [deg],d [mm],theta [deg],Range [deg]\n0,100.5,0,{cell}\n0,1,0,\n", encoding="utf-8")
+    limits = read_sheet(path, "modified").robot.limits
+    assert limits[0] == pytest.approx(np.radians([-170, 170]))
+    assert np.isinf(limits[1]).all()
+
+
 def test_a_written_table_has_one_system_of_units_and_reads_back_exactly(tmp_path: Path) -> None:
     path = tmp_path / "arm.csv"
     mdh = ARM.mdh + 1e-4 * RNG.normal(size=(6, 5))

@@ -13,9 +13,9 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.layout import RawTable, TableOptions, is_missing
-from rpim_opt.basics.tables import Columns, numbers
+from rpim_opt.basics.tables import Columns, is_numeral, numbers
 from rpim_opt.basics.text import listed
-from rpim_opt.basics.units import DISPLAY, UNITS, accepted_units, split, split_unit
+from rpim_opt.basics.units import DISPLAY, UNITS, accepted_units, numeral, split, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables import names as known_names
 from rpim_opt.data.tables.names import Meaning, Meanings, endings, numbered, quaternion_columns, recognize
@@ -26,6 +26,8 @@ TURNED = ("rx", "ry", "rz")
 """Columns of three turns; without a unit they may also be a rotation vector, as Universal Robots' are."""
 COORDINATES = {"x", "y", "z"}
 ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
+READING = re.compile(r"((?:p|pos|position|meas|measured|shot)?[\s_]*([xyz]))[\s_]*([1-9])", re.IGNORECASE)
+NEAR_READINGS = 0.01  # part of the points' spread up to which those of a row are one point, and no other reflectors
 INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
 """In the name of a coordinate that is not the robot's own; actual may be either."""
 CONTROLLER = re.compile(r"\$?pos_act|actual_tcp", re.IGNORECASE)
@@ -105,6 +107,7 @@ def interpret(
     ``joints`` are the names of the robot's file. Of ``targets`` what was commanded counts; rows may lack either values.
     """
     units = options.units
+    raw = _readings_below_each_other(raw)
     options = replace(options, units={**raw.units, **units}, joints=tuple(joints))
     if options.rotation not in ("", "vector") and not known_names.EULER.fullmatch(options.rotation):
         accepted = "vector, or extrinsic or intrinsic with the order of the turns: 'extrinsic xyz', 'intrinsic zyx'"
@@ -134,6 +137,33 @@ def interpret(
     other = [(units[of], each) for of, each in headed.items() if units.get(of, each.unit) != each.unit]
     notes = [f"--units {unit} does not apply: the header has '{m.column}' in {m.unit}." for unit, m in other]
     return replace(table, notes=(*table.notes, *notes))
+
+
+def _readings_below_each_other(raw: RawTable) -> RawTable:
+    """Return a table with a row a reading, where several of one point stand side by side, X1, Y1, Z1, X2, ...
+
+    Names of the points, a text in every row that no other has, get the reading's number.
+    """
+    named = {name: READING.fullmatch(split(name)[0].strip()) for name in raw.columns}
+    of = {(int(match[3]), match[2].lower()): name for name, match in named.items() if match}
+    count = max((number for number, _ in of), default=0)
+    if count < 2 or sorted(of) != [(k, axis) for k in range(1, count + 1) for axis in "xyz"]:
+        return raw
+    values = np.array([[numeral(str(cell)) for cell in raw.columns[of[each]]] for each in sorted(of)])
+    values = values.reshape(count, 3, -1)
+    if not np.ptp(values, axis=0).max() < NEAR_READINGS * values.std(axis=2).max():
+        return raw
+    columns: dict[str, Sequence[Any]] = {}
+    for name, cells in raw.columns.items():
+        match = named[name]
+        if match is None:
+            names = _unique(cells) and not any(map(is_numeral, cells))
+            columns[name] = [f"{cell}/{k}" if names else cell for cell in cells for k in range(1, count + 1)]
+        elif match[3] == "1":
+            readings = (raw.columns[of[k, match[2].lower()]] for k in range(1, count + 1))
+            columns[name.replace(match[0], match[1], 1)] = [cell for row in zip(*readings, strict=True) for cell in row]
+    note = f"{count} readings of every point stand side by side: each is a row, of the same configuration."
+    return replace(raw, columns=columns, notes=(*raw.notes, note))
 
 
 def _as_quaternions(columns: Columns, meant: Sequence[Column], rotation: str) -> tuple[Columns, list[Column]]:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -44,7 +45,11 @@ SHEET = {"\u03b1": "alpha", "\u237a": "alpha", "θ": "theta", "β": "beta", "twi
          "q\u207b": "lower", "q\u207a": "upper"}  # fmt: skip
 """Other names of columns, those that the Robotics Toolbox prints among them."""
 RANGE = re.compile(r"[\s_]*(?:range|limits?|bereich|grenzen?)[\s_]*")
-"""Beside the word of a limit, ``range min``, ``lower limit``; alone a column of both, which cells cannot hold."""
+"""Beside the word of a limit, ``range min``, ``lower limit``; alone a column of both."""
+BOTH_LIMITS = re.compile(
+    r"(?:[±+]\s*({0})|([+-]?{0})\s*°?\s*(?:\.\.+|…|/|to|bis|~|-|\u2013)\s*([+-]?{0}))?\s*°?".format(r"\d+(?:\.\d+)?")
+)
+"""Two limits in a cell, ``±180``, ``-180..180``; tables of text have their ± as +."""
 SHEET_ORDER = ("theta", "d", "a", "alpha", "beta")  # of a data sheet in the standard convention
 JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")  # columns of the joints' own names
 ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*°?", re.IGNORECASE)
@@ -202,8 +207,10 @@ def read_robot(path: str | Path) -> Robot:
 
 
 @of_file
-def read_sheet(path: Path, convention: str = "") -> RobotSetup:
+def read_sheet(path: Path, convention: str = "", units: Mapping[str, str] = MappingProxyType({})) -> RobotSetup:
     """Return the robot of a table with one row per joint, in the convention stated there or by ``convention``.
+
+    Where neither header nor cells state units of angles or lengths they are those of ``units``, by dimension.
 
     ``modified`` (Craig, proximal) is that of this package. ``standard`` (Paul, distal) and, with a column beta, that of
     Hayati are converted exactly; what follows the last joint becomes the tool::
@@ -216,7 +223,7 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
         cells = [cell for cell in row if cell]
         if len(cells) > len(raw.columns) / 2 or any(map(is_numeral, cells)) or JOINT_NAME.fullmatch(cells[0]):
             raise InputError("the table", f"'{', '.join(cells)[:60]}', no row of numbers", "one row per joint")
-    columns, notes = _sheet_columns(raw)
+    columns, notes = _sheet_columns(raw, units)
     conventions = {convention, *(cell.lower() for cell in columns.pop("convention", []))} - {""}
     if any(INDEX_BEFORE.search(name) for name in raw.columns):
         conventions.add("modified")
@@ -232,7 +239,7 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
     return replace(arm, notes=(*(note for note in raw.notes if "is not a row of the table" in note), *notes))
 
 
-def _sheet_columns(raw: RawTable) -> tuple[dict[str, list[str]], list[str]]:
+def _sheet_columns(raw: RawTable, units: Mapping[str, str]) -> tuple[dict[str, list[str]], list[str]]:
     """Return the columns of a sheet as texts, by the keys of ``robot.toml``, and notes; without joints' names."""
     columns: dict[str, list[str]] = {}
     notes: list[str] = []
@@ -251,15 +258,26 @@ def _sheet_columns(raw: RawTable) -> tuple[dict[str, list[str]], list[str]]:
             if not (degrees and "rad" in stated):  # radians in a column of degrees are refused below
                 (unit,) = stated
                 notes.append(f"column '{name}' states no unit: {unit}, as the other angles are.")
-        if stem in MDH_DIMENSION and not unit:
-            accepted = " or ".join(f"{stem} [{of[MDH_DIMENSION[stem]]}]" for of in (DISPLAY, SI))
+        dimension = MDH_DIMENSION.get(stem, "")
+        if not unit and dimension in units:
+            unit = units[dimension]
+            notes.append(f"column '{name}' states no unit: {unit} by --units.")
+        if dimension and not unit:
+            accepted = " or ".join(f"{stem} [{of[dimension]}]" for of in (DISPLAY, SI)) + ", or --units deg,mm or rad,m"
             raise InputError("the header", f"column '{name}' without a unit", accepted)
+        stems = {stem: texts}
         if stem == "limits":
-            raise InputError("the header", f"both limits in a column, '{name}'", "columns lower [deg] and upper [deg]")
-        key = stem + (f"_{unit}" if unit else "")
-        if key in columns:
-            raise InputError("the header", ", ".join(raw.columns), "every column once")
-        columns[key] = texts
+            pairs = [BOTH_LIMITS.fullmatch(text) for text in texts]
+            if not all(pairs):
+                accepted = "cells as ±180 or -170..190, or columns lower [deg] and upper [deg]"
+                raise InputError("the header", f"both limits in a column, '{name}'", accepted)
+            lower = [f"-{each[1]}" if each[1] else each[2] or "" for each in pairs if each]
+            stems = {"lower": lower, "upper": [each[1] or each[3] or "" for each in pairs if each]}
+        for stem, texts in stems.items():
+            key = stem + (f"_{unit}" if unit else "")
+            if key in columns:
+                raise InputError("the header", ", ".join(raw.columns), "every column once")
+            columns[key] = texts
     return columns, notes
 
 

@@ -17,8 +17,7 @@ from rpim_opt.basics.tables import EXCEL, TEXTS, Grid, decoded
 Rows = Sequence[Mapping[str, Any]]
 """Cells by the names of their columns, with units as in headers: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
 
-NO_TABLES = (".xml", ".pdf", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl",
-             ".py", ".ipynb")  # fmt: skip
+NO_TABLES = (".pdf", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl", ".py", ".ipynb")
 """Endings of files that are no tables as text; any other unknown ending may be one of an instrument's table."""
 
 
