@@ -280,7 +280,7 @@ def new(
         )  # fmt: skip
     document = made.understood.content()
     document["notes"] += made.notes
-    return Output(made, {"written": [] if dry_run else [made.folder], **document})
+    return Output(made, {"written": [made.folder] * (not dry_run), **document})
 
 
 @command
@@ -298,13 +298,14 @@ def inspect(problem: Problem, variant: Variant = None) -> Output:
         validation = {} if apart is None else {name: apart.of_robot(name) for name in {*apart.robot}}
         prior = instance.prior if len(whole.arms) == 1 else None  # names of one robot's parameters may be others'
         parts = {name: ro.calibration.inspect(whole.alone(name), validation.get(name), prior) for name in whole.arms}
-        together = f"\n\nAll robots together: {ro.problem.observe(whole)}" if len(parts) > 1 else ""
-    document: dict[str, Any] = {"title": instance.record.title, "source": instance.record.source}
-    text = "\n".join(filter(None, [instance.record.title, instance.record.source]))
-    for name, part in parts.items():
-        document |= {name: part.content()} if name else part.content()
-        text += f"\n\nRobot {name}\n\n{part}" if name else f"\n\n{part}"
-    text += together
+        heads = {name: f"Robot {name}\n\n" * bool(name) for name in parts}
+        texts = [f"\n\n{heads[name]}{part}" for name, part in parts.items()]
+        if len(parts) > 1:
+            texts.append(f"\n\nAll robots together: {ro.problem.observe(whole)}")
+    documents = {name: part.content() for name, part in parts.items()}
+    about = {"title": instance.record.title, "source": instance.record.source}
+    document = {**about, **documents.get("", documents)}  # of a single robot without a name
+    text = "".join(["\n".join(filter(None, about.values())), *texts])
     refused = any(part.fit is not None and not part.fit.verdict.delivered for part in parts.values())
     return Output(text, document, int(refused))
 
@@ -343,8 +344,7 @@ def calibrate(
         changes: dict[str, Any] = {key: word for key, word in words.items() if word}
         if selector:
             changes["weight"] = named_weight(selector)
-        learning = changes.get("weight", instance.weight) is None
-        say("estimating the prior's scales" if learning else "choosing the weight")
+        say("estimating the prior's scales, or choosing the weight")
         changes["progress"] = lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}")
         result = instance.calibrate(**changes)
         without = [flag.label for flag in result.flagged if drop_outliers and flag.label not in result.clustered]
@@ -357,9 +357,10 @@ def calibrate(
         say("computing the summary")
         document = summary(result, instance.published)
     text = describe(result, document)
-    if drop_outliers:
-        rows = f"Refitted without {', '.join(without)}" if without else "No flagged row to drop: nothing was refitted"
-        text = f"{rows}.\n\n{text}"
+    if without:
+        text = f"Refitted without {', '.join(without)}.\n\n{text}"
+    elif drop_outliers:
+        text = f"No flagged row to drop: nothing was refitted.\n\n{text}"
     code = CODES[document["conclusion"]] if result.verdict.delivered else 1
     return Output(text, {**document, "refitted_without": without}, code, _saved(result, out))
 
@@ -521,10 +522,10 @@ def monitor(
     """
     with _loaded(result) as (loaded, _):
         read = ro.use.read_measurements(loaded, checks, measurement, tables.options)
-        monitoring = ro.use.monitor(loaded, read.data, read.when, read.clock[1] if read.clock else (), register)
-        if out is not None:
-            ro.report.write_checks(monitoring, out, loaded.record.title)
-    written = [] if out is None else [out]
+        monitoring = ro.use.monitor(loaded, read.data, read.when, read.clock[1], register)
+        written = [*filter(None, [out])]
+        for file in written:
+            ro.report.write_checks(monitoring, file, loaded.record.title)
     return Output(monitoring, monitoring.content(), int(monitoring.drifts), written, read)
 
 
@@ -560,7 +561,7 @@ def export(
             mdh=mdh, dh=dh, robodk=robodk, corrections=corrections, root=urdf_base, tip=urdf_tip,
             tip_measured=tip_measured, marker=marker, robot=robot, despite_verdict=despite_verdict,
         )  # fmt: skip
-    code = CODES["inconclusive" if exported.inconclusive else "accepted"]
+    code = CODES["inconclusive"] * exported.inconclusive
     return Output("\n".join(exported.notes), {"notes": exported.notes}, code, exported.files)
 
 
@@ -599,7 +600,7 @@ def compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=orientation,
             tool=at, marker=marker or "", base=base, largest=largest,
             payload=read.payload if mass is None else mass, payload_centre=centre, despite_verdict=despite_verdict,
-            limit=None if limit is None else 1e-3 * limit,
+            limit=limit and 1e-3 * limit,
         )  # fmt: skip
     code = int(bool(compensation.missed))
     return _with_table(compensation, compensation.csv(), out, compensation.content(), code=code, read=understood)
@@ -640,9 +641,9 @@ def design(
 
         say("reading the problem")
         posed = ro.load(problem).problem
-        where = ""
+        where, label = "", None
         if table is not None:
-            q = read_candidates(table, posed.robot)
+            q, label = read_candidates(table, posed.robot), read_columns(table).get("label")
         elif posed.data.blocks[0].measurement.touching:
             place = console.touched_point(point) or touched_place(posed)
             q = ro.problem.configurations_at(posed, np.tile(place, (candidates, 1)), seed)
@@ -657,7 +658,6 @@ def design(
     if augment:
         where += "\nThen calibrate all tables together (`new FOLDER --data OLD --data NEW`); `update` keeps the model."
     columns = joint_cells(posed.robot, q[chosen.chosen], chosen.chosen)
-    label = None if table is None else read_columns(table).get("label")
     if label is not None:
         columns["label"] = [str(label[k]) for k in chosen.chosen]
     document = {"criterion": criterion, "value": chosen.value, "bound": chosen.bound, "gap": chosen.gap}
@@ -704,7 +704,7 @@ def compare(
 
     With --out every replicate is stored when it is finished, and README.md with the figure at the end.
     """
-    journal = None if out is None else out / "replicates.jsonl"
+    journal = out and out / "replicates.jsonl"
     words, numbers = console.listed_words, console.listed_numbers
     comparison = ro.compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),
@@ -755,8 +755,8 @@ def _saved(result: "ro.calibration.Calibration", out: Path | None) -> list[Path]
 
 def _with_table(found: object, rows: str, out: Path | None, document: dict[str, Any], **more: Any) -> Output:
     """Return what was found, with its table where no file takes it."""
-    text = str(found) if out else f"{found}\n{rows.rstrip()}"
-    return Output(text, document, written=console.written_to(out, rows), **more)
+    text = [str(found), *[rows.rstrip()] * (not out)]
+    return Output("\n".join(text), document, written=console.written_to(out, rows), **more)
 
 
 def _against(limit: float | None, name: str, value: float) -> tuple[list[str], bool | None]:
@@ -781,5 +781,5 @@ def main() -> None:
                 sys.exit(error.exit_code)
             console.fail(error.format_message(), error.exit_code)
         except RpimError as error:
-            text = error.command if isinstance(error, InputError) else str(error)
+            text = getattr(error, "command", str(error))
             console.fail(text, next((code for kind, code in FAILURES.items() if isinstance(error, kind)), 2))

@@ -55,8 +55,13 @@ class Spectrum(NamedTuple):
     `WAVES`; squared frequencies and measures are (c,).
     """
 
-    w2: Array
-    measure: Array
+    w2: Array = np.zeros(0)
+    measure: Array = np.zeros(0)
+
+    @property
+    def hyperparameters(self) -> tuple[str, ...]:
+        """Names of its hyperparameters; none without coefficients."""
+        return tuple(CURVES) * (len(self.w2) > 0)
 
     def variances(self, size: float, length: float) -> tuple[Array, Array, Array]:
         """Return variances (c,) at logarithms of ripple's size and length, slopes (c, 2) and curvature of ln."""
@@ -86,7 +91,7 @@ class Hierarchy:
     replaced: np.ndarray
     rows: Array
     values: Array
-    spectrum: Spectrum | None = None
+    spectrum: Spectrum = field(default_factory=Spectrum)
 
     @property
     def geometry(self) -> np.ndarray:
@@ -106,7 +111,7 @@ class Hierarchy:
     @property
     def hyperparameters(self) -> tuple[str, ...]:
         """Names of the groups, and of the spectrum's hyperparameters."""
-        return self.names if self.spectrum is None else (*self.names, *CURVES)
+        return (*self.names, *self.spectrum.hyperparameters)
 
     def variances(self, logs: Array) -> tuple[Array, Array, Array]:
         """Return variances (p,) without local scales, slopes (p, s) of ln by the logs, and a spectrum's curvature."""
@@ -115,7 +120,7 @@ class Hierarchy:
         slopes = np.zeros((len(variances), len(logs)))
         slopes[:, :g] = 2.0 * (self.group[:, None] == np.arange(g))
         curvature = np.zeros((0, len(CURVES), len(CURVES)))
-        if self.spectrum is not None:
+        if len(self.spectrum.w2):
             own, curves = slice(len(variances) - len(self.spectrum.w2), None), slice(g, g + len(CURVES))
             variances[own], slopes[own, curves], curvature = self.spectrum.variances(*logs[curves])
         slopes[self.replaced] = 0.0
@@ -282,7 +287,7 @@ class Point:
         precision = information[:, None] * log_v
         curvature[s:, s:] += among - twice - direct[:, s:].T @ precision[:, s:]
         curvature[s:, s:] += 2 * (f @ z_by_noise + np.diag(by_noise))
-        if prior.spectrum is not None:
+        if len(bend):
             curves = slice(s - len(CURVES), s)
             curvature[curves, curves] += np.tensordot((1 - e2 / v)[len(v) - len(bend) :], bend, axes=1)
         of_z = C @ (z[:, None] * precision)
@@ -344,7 +349,8 @@ class Evidence:
         """Root L (s, s) of their prior precision L'L."""
         scales = np.linalg.inv(np.linalg.cholesky(self.prior.covariance))
         others = self.names[len(self.prior.names) :]
-        precisions = [1 / CURVES[name][1] if name in CURVES else 1 / NOISE_SD for name in others]
+        spreads = {name: spread for name, (_, spread) in CURVES.items()}
+        precisions = [1 / spreads.get(name, NOISE_SD) for name in others]
         return np.asarray(block_diag(scales, np.diag(precisions)), dtype=float)
 
     def repeatability(self, logs: Array) -> Repeatability:
@@ -405,7 +411,7 @@ class Evidence:
         noisy = 3.0 * np.isin(self.names, self.noise)
         geometry = 2.0 * np.isin(np.arange(len(self.centre)), self.prior.geometry)
         starts = [self.centre + noisy, self.centre, self.centre + geometry]
-        starts = starts[0 if noisy.any() else 1 : 3 if geometry.any() else 2]
+        starts = [*{start.tobytes(): start for start in starts}.values()]  # each once
         return starts if sum(len(stack.index) for stack in self.data.stacks) <= FEW else starts[:1]
 
     def restricted(self, keep: np.ndarray) -> Evidence:
@@ -450,9 +456,8 @@ class Evidence:
 
     def _settled(self, parts: Sequence[Whitened], size2: Array, v: Array) -> tuple[Array, Array, float, Array]:
         """Return z, C, -ln|C| and v, which are solved jointly; curves are integrated out first."""
-        spectrum = self.prior.spectrum
         p = len(size2)
-        g = p if spectrum is None else p - len(spectrum.w2)
+        g = p - len(self.prior.spectrum.w2)
         X = np.concatenate([part.X.reshape(-1, p) for part in parts])
         y = np.concatenate([part.y.ravel() for part in parts])
         information, regression, own, logdet = _eliminated(X[:, g:], np.column_stack([X[:, :g], y]), size2[g:])

@@ -212,7 +212,7 @@ class Estimator:
             replaced=stated.replaced,
             rows=stated.rows * stated.scale,
             values=stated.values - stated.rows @ stated.centre,
-            spectrum=spectrum_of(self.curves, unit) if self.curves else None,
+            spectrum=spectrum_of(self.curves, unit),
         )
         have = {"instrument"}
         if any(stack.unit is not None or stack.length.any() for stack in stacks):
@@ -259,10 +259,10 @@ class Estimator:
 
 def spectrum_of(curves: Sequence[Curve], unit: Array) -> Spectrum:
     """Return prior variances of curve coefficients, which are the last of the (n,) deviations in these units [SI]."""
-    w, share = [], []
+    w, share = [np.zeros(0)], [np.zeros(0)]
     for curve in curves:
         step = 2 * np.pi / curve.period
-        own = np.append(np.arange(1, curve.waves + 1), step * np.arange(1, curve.harmonics + 1))
+        own = np.append(np.arange(1.0, curve.waves + 1), step * np.arange(1, curve.harmonics + 1))
         between = np.concatenate([[own[0] / 2], (own[1:] + own[:-1]) / 2, [own[-1] + step / 2]])
         w += [own, own]
         share += [np.diff(between) / (2 * np.pi)] * 2  # a coefficient stands for the frequencies nearest to its own
@@ -351,9 +351,12 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     C = point.C + widened @ widened.T
     drift = [point.slopes @ root, widened]
     drift.append(tail_widening(point.z + C @ (taken * point.z), C, point.v, heavy, scales, prior.tails))
-    if prior.spectrum is None:  # curves have a prior of their own; a prediction may leave the range of any joint
+    if not len(prior.spectrum.w2):  # curves have a prior of their own; a prediction may leave the range of any joint
         factors = evidence.overdispersion(point, fit.problem.joint_values[fit.problem.owners])
         drift.append(widening(point.C, factors.max()))
+    curves = None
+    if len(prior.spectrum.w2):
+        curves = Transmitted(*values[groups:noise], gain=gain)
     return Learned(
         scales=dict(zip(prior.names, values[:groups], strict=True)),
         noise=dict(zip(evidence.noise, values[noise:], strict=True)),
@@ -364,6 +367,6 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         stated=fit.problem.parameters.free.scale,
         drift=fit.unit[:, None] * np.column_stack(drift),
         notes=tuple(notes),
-        curves=None if prior.spectrum is None else Transmitted(*values[groups:noise], gain=gain),
+        curves=curves,
         **more,
     )

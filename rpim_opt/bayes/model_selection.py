@@ -138,9 +138,9 @@ class Models:
         possible = [tuple(each for each in candidate if each in self.extensions) for candidate in CANDIDATES]
         candidates = [fitted((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
         best = min(candidates, key=lambda each: each.criterion)
-        further = FURTHER if len(np.unique(self.problem.data.configuration)) >= MANY else {}
-        for extension, beside in further.items():
-            if extension in self.extensions:
+        many = len(np.unique(self.problem.data.configuration)) >= MANY
+        for extension, beside in FURTHER.items():
+            if many and extension in self.extensions:
                 more = (*best.extensions, beside, extension)
                 arm = [each for each in ARM if each in more and each in self.extensions]
                 candidates.append(fitted((*arm, *conditions)))
@@ -195,7 +195,7 @@ def _start(evidence: Evidence, known: Mapping[str, float]) -> Array:
     whose effect the noise has taken up.
     """
     pairs = zip(evidence.names, evidence.centre, strict=True)
-    return np.array([known[name] if name in known else centre + LARGE for name, centre in pairs])
+    return np.array([known.get(name, centre + LARGE) for name, centre in pairs])
 
 
 # --- at a result ------------------------------------------------------------------------------------------------
@@ -211,14 +211,13 @@ class Comparison(Models):
         self.result = result
         estimator = Estimator(Prior(), NOISE)
         if result.learned is not None:
-            more = ("instrument",) if "instrument" in result.learned.noise else ()
-            estimator = Estimator(KNOWN, NOISE + more)
+            estimator = Estimator(KNOWN, NOISE + ("instrument",) * ("instrument" in result.learned.noise))
         problem = sampled(result.problem.with_repeatability(None))  # in memory, without noise estimates
         labels = {label: i for i, label in enumerate(problem.labels)}
         rows = np.array([labels[flag.label] for flag in result.flagged if flag.label in labels], dtype=int)
         if 0 < len(rows) <= len(labels) / 4:  # without flagged rows unless their neighbours are
             alone = {problem.labels[i] for i in rows[~clustered(problem, result.x, rows)]}
-            problem = problem.without(alone) if alone else problem
+            problem = problem.without(alone)
         super().__init__(problem, estimator, named(result.problem, result.x))
         stacks = self.columns.data.stacks
         self.configurations = len(np.unique(self.problem.data.configuration))

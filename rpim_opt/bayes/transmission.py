@@ -113,7 +113,7 @@ def _given(evidence: Evidence, keep: np.ndarray, v: Array, columns: Array, curve
         names=(),
         replaced=np.append(prior.replaced, np.zeros(c, dtype=bool)),
         rows=np.pad(prior.rows * width, ((0, 0), (0, c))),
-        spectrum=spectrum_of(curves, np.ones(c)) if curves else None,
+        spectrum=spectrum_of(curves, np.ones(c)),
     )
     X = np.hstack([evidence.data.X[:, keep] * width, columns])
     return replace(evidence, data=replace(evidence.data, X=X), prior=known)

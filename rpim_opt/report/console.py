@@ -132,17 +132,19 @@ def requirement_of(
     from rpim_opt.data.record import Requirement
 
     require_positive("--limit", limit)
-    if box is not None and limit is None and stated is None:
-        raise InputError("--box", "no limit", "--limit with it [mm]")
-    changes: dict[str, Any] = {} if limit is None else {"limit": 1e-3 * limit}
+    if limit is None and stated is None:
+        if box is not None:
+            raise InputError("--box", "no limit", "--limit with it [mm]")
+        return None
+    changes: dict[str, Any] = {}
+    if limit is not None:
+        changes["limit"] = 1e-3 * limit
     if box is not None:
         ends = [1e-3 * end for end in _numbers("--box", box, (6,), "six numbers: x0,x1,y0,y1,z0,z1 [mm]")]
         changes["box"] = tuple(zip(ends[::2], ends[1::2], strict=True))
     if measured is not None:
         changes["measured"] = measured
-    if stated is not None:
-        return replace(stated, **changes)
-    return Requirement(**changes) if limit is not None else None
+    return replace(stated or Requirement(limit=1.0), **changes)
 
 
 def listed_words(text: str) -> list[str]:

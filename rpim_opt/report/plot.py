@@ -67,13 +67,13 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     if few:
         ax.vlines(place, before, after, color=COLORS["before"])
     for when, model, each in (("before", "nominal", before), ("after", "identified", after)):
-        _dots(ax, place, each, when, model, ms=5.0 if few else 2.0)
-    flagged = {flag.label for flag in result.flagged} if data is result.problem.data else set()
+        _dots(ax, place, each, when, model, ms=2.0 + 3.0 * few)
+    flagged = {flag.label for flag in result.flagged if data is result.problem.data}
     at = [i for i, label in enumerate(labels) if label in flagged]
     if at:
         _dots(ax, place[at], after[at], "mark", "flagged")
     cut = np.count_nonzero(both < low)
-    note = f"\n{cut} errors below {low:.2g} mm are drawn at the lower edge." if cut else ""
+    note = f"\n{cut} errors below {low:.2g} mm are drawn at the lower edge." * bool(cut)
     ax.set(xlabel=f"row{note}", ylabel="error [mm]")
     if few:
         _name(ax, "x", labels)
@@ -114,7 +114,7 @@ def parameters(result: Calibration, dimension: str = "length", ax: Axes = None) 
     # an interval that ends far out would hide all others: it is cut at the edge
     middle = np.median(np.abs(x) + spread) if len(x) else 0.0
     reach = 1.1 * max([1e-9, *np.abs(x), *bound[bounded], middle])
-    cut = "\nIntervals beyond the axis are clipped." if (np.abs(x) + spread > reach).any() else ""
+    cut = "\nIntervals beyond the axis are clipped." * bool((np.abs(x) + spread > reach).any())
     ax.set(xlim=(-reach, reach), xlabel=f"deviation from nominal [{unit}]{cut}")
     _name(ax, "y", [free.names[i] for i in own])
     return _with_legend(ax)
@@ -151,7 +151,7 @@ def l_curve(of: Program | Calibration, ax: Axes = None) -> Axes:
     >>> print(ax.get_legend().get_texts()[0].get_text())
     chosen: reml, weight 1.5
     """
-    program = of.program if isinstance(of, Calibration) else of
+    program: Any = getattr(of, "program", of)
 
     def at(weight: float) -> list[Array]:
         """Return the curve's point at a weight, or none: far from the chosen one a solver may fail."""
@@ -176,10 +176,10 @@ def l_curve(of: Program | Calibration, ax: Axes = None) -> Axes:
     return _with_legend(ax)
 
 
-def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | None, view: str, ax: Axes) -> None:
+def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float, view: str, ax: Axes) -> None:
     """Draw a map of the expanded uncertainties (N,) at positions (N, 3), all in mm, as a `VIEWS` sees it.
 
-    Each cell has the largest one of its positions; it is red above the limit. The box (3, 2) is drawn as a frame.
+    Each cell has the largest one of its positions; it is red above the limit. A box (3, 2) is drawn as a frame.
     """
     from matplotlib.colors import LinearSegmentedColormap
 
@@ -189,7 +189,7 @@ def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | N
     count = np.maximum(np.ceil(extent / (extent.max() / CELLS) - 1e-9), 1).astype(int)
     grid, x, y, _ = scipy.stats.binned_statistic_2d(*plane, bound, "max", bins=count.tolist())
     high = float(bound.max())
-    top = high if limit is None else min(high, limit)
+    top = min(high, limit)
     colours = LinearSegmentedColormap.from_list("U", [FAINT, COLORS["after"]]).with_extremes(over=COLORS["mark"])
     drawn = ax.pcolormesh(x, y, grid.T, cmap=colours, vmin=min(float(bound.min()), 0.9 * top), vmax=top)
     said = {"label": "U [mm], above the limit in red", "extend": "max"} if high > top else {"label": "U [mm]"}
@@ -206,15 +206,17 @@ def checks(found: Monitoring, ax: Axes, sums: bool = False) -> None:
     if found.when is not None and np.ptp(found.when) > 0:
         unit, name = next((size, name) for size, name in TIMES if np.ptp(found.when) > 2 * size or size == 1)
         place, along = (found.when - found.when[0]) / unit, f"{name} since the first check"
-    values, allowed, beyond = found.sigmas, found.allowed, list(found.beyond)
-    if sums:
-        values, allowed = found.sums, np.full(len(place), found.limit)
-        beyond = [] if found.alarm is None else [found.alarm]
+    values, allowed, name, what = found.sigmas, found.allowed, "check", "residual [standard deviations]"
+    marked = None
+    if sums:  # the first one alone is marked
+        values, allowed, name, what = found.sums, np.full(len(place), found.limit), "sum", "cumulative sum"
+        marked = 1
+    beyond = np.flatnonzero(values > allowed)[:marked]
     ax.plot(place, allowed, color=COLORS["mark"], lw=1.5, label="limit")
     ax.plot(place, values, color=COLORS["after"], lw=0.8)
-    _dots(ax, place, values, "after", "sum" if sums else "check")
+    _dots(ax, place, values, "after", name)
     _dots(ax, place[beyond], values[beyond], "mark")
-    ax.set(xlabel=along, ylabel="cumulative sum" if sums else "residual [standard deviations]")
+    ax.set(xlabel=along, ylabel=what)
     ax.set_ylim(bottom=0)
     _with_legend(ax)
 
@@ -249,16 +251,18 @@ def logarithmic(ax: Axes, which: str) -> None:
 
 def _name(ax: Axes, which: str, names: Sequence[str]) -> None:
     """Name the places 1, 2, ... along an axis, from top to bottom; of rows so many that the names can be read."""
-    limits = (0.5, len(names) + 0.5)
     box = ax.get_window_extent()
-    length, largest = (box.width, FONT_X) if which == "x" else (box.height, FONT_Y)
+    first, last = 0.5, len(names) + 0.5
+    limits, length, largest, least, turned = (last, first), box.height, FONT_Y, 0.0, 0
+    if which == "x":
+        limits, length, largest, least = (first, last), box.width, FONT_X, FONT_LEAST
+        turned = 90 * (len(names) > 3)
     size = length * 72 / ax.figure.dpi / (LINE_HEIGHT * max(len(names), 1))
-    step = int(np.ceil(FONT_LEAST / size)) if which == "x" else 1
-    turned = 90 if which == "x" and len(names) > 3 else 0
+    step = max(int(np.ceil(least / size)), 1)
     size = min(step * size, largest * ax.xaxis.label.get_fontsize())
     ticks = range(1, len(names) + 1, step)
     getattr(ax, f"set_{which}ticks")(ticks, list(names[::step]), fontsize=size, rotation=turned)
-    ax.set(**{f"{which}lim": limits if which == "x" else limits[::-1]})
+    ax.set(**{f"{which}lim": limits})
 
 
 def _with_legend(ax: Axes) -> Axes:

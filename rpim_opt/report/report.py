@@ -21,7 +21,7 @@ from rpim_opt.basics.units import joint_columns, printed
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
+from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept
 from rpim_opt.calibration.held_out import coverage_text, headline_errors, rows_used
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -39,7 +39,7 @@ from rpim_opt.report.summary import mm
 from rpim_opt.robot.parameters import own_name
 from rpim_opt.store.problem_file import FIELDS
 from rpim_opt.store.result_file import definition
-from rpim_opt.use.export import FLANGE, beyond_geometry
+from rpim_opt.use.export import FLANGE, beyond_geometry, tested
 from rpim_opt.use.sessions import in_session, session_notes
 from rpim_opt.use.validation import Validation
 
@@ -81,26 +81,26 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     new = new or {}
     result = in_session(result)
     heading = result.record.title or " and ".join(robot.name for robot in result.problem.arms.values())
-    lacking = judged(result)
-    composition = [] if lacking is None else lacking.sentences()
     warnings = summary.warnings(result, checked=bool(new))
-    if lacking is not None and lacking.alarming:  # said at the top; otherwise it is a diagnosis
-        warnings = [" ".join(composition), *warnings]
-        composition = []
+    composition: list[str] = []
+    if lacking := judged(result):
+        composition = lacking.sentences()
+        if lacking.alarming:  # said at the top; otherwise it is a diagnosis
+            warnings.insert(0, " ".join(composition))
+            composition = []
     left_out = [str(row) for row in result.left_out]
     if left_out:
         warnings.append(f"Excluded outliers: {counted(len(left_out), 'row')}, {listed(left_out)}.")
-    accepted = None if result.record.requirement is None else accept(result)
-    workspace = measured_workspace(result) if accepted is None else accepted.workspace
+    accepted, workspace = tested(result)
     if workspace is not None and not np.isfinite(workspace.expanded).all():
         workspace = None
     warnings = [f"New measurements, {name}: {each.failure}" for name, each in new.items() if each.failure] + warnings
     tests = {}
-    for name, each in new.items() if accepted is not None else ():
-        with contextlib.suppress(InputError):  # rows that are read in another way: a failure
+    for name, each in new.items():
+        with contextlib.suppress(InputError):  # no requirement; rows that are read in another way: a failure
             tests[name] = accept(result, data=each.data)
-    tested, accepted = max(tests.items(), key=lambda of: FAVOURABLE.index(of[1].verdict), default=("", accepted))
-    content = Content(result, accepted, tested, _errors(result, new), workspace, composition, new)
+    by, accepted = max(tests.items(), key=lambda of: FAVOURABLE.index(of[1].verdict), default=("", accepted))
+    content = Content(result, accepted, by, _errors(result, new), workspace, composition, new)
     headline = list(_headline(content))  # refuses rows without a length, before any figure is drawn
     sections = [(name, list(section(content))) for name, section in SECTIONS]
     return render(
@@ -139,9 +139,9 @@ def _headline(content: Content) -> Iterator[Block]:
             text += " It holds for the whole model, as `compensate` uses it; files with geometry alone have another U."
         yield "verdict", {"kind": accepted.verdict, "word": word, "text": text}
     elif result.verdict.delivered:
-        doubt = inconclusive(result, content.map)
-        word, _, text = (doubt or summary.delivered(result)).partition(": ")
-        yield "verdict", {"kind": "inconclusive" if doubt else "accepted", "word": word, "text": text}
+        kind, sentence = summary.conclusion(result, content.map)
+        word, _, text = sentence.partition(": ")
+        yield "verdict", {"kind": kind, "word": word, "text": text}
     yield "lead", {"text": summary.headline(result, content.errors), "alarm": not result.verdict.delivered}
     yield "notes", [*filter(None, [result.verdict.caution]), *reasons, *result.verdict.beside(result.causes)]
     name, nominal, identified = content.errors
@@ -173,7 +173,7 @@ def _accuracy(content: Content) -> Iterator[Block]:
     record = result.record
     found = content.accepted
     if found is not None:
-        yield "heading", f"Acceptance test by {content.tested}" if content.tested else "Acceptance"
+        yield "heading", {"": "Acceptance"}.get(content.tested, f"Acceptance test by {content.tested}")
         said = (*found.reasons, found.caution)  # at the top
         lines = [text for text in found.sentences()[1:] if text not in said]
         if found.workspace is not None:
@@ -233,13 +233,15 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
         "of the configurations that reach it, at any depth. Axes of the robot's base. Not included are effects that no "
         "reading varied: the instrument's scale, temperature and other loads than the measured ones."
     ]
-    required = result.record.requirement is not None
-    limit = 1e3 * map_.requirement.limit if required else None
-    stated = [] if required else [f"{map_.summary}; region: {map_.requirement.where}."]
-    yield "text", [*stated, *notes, *session_notes(result)]
-    box = None if map_.region.box is None else 1e3 * map_.region.box
+    limit, box, frame = np.inf, None, ""
+    if result.record.requirement is None:
+        notes.insert(0, f"{map_.summary}; region: {map_.requirement.where}.")
+    else:
+        limit = 1e3 * map_.requirement.limit
+    if map_.region.box is not None:
+        box, frame = 1e3 * map_.region.box, " The frame is the box of the requirement."
+    yield "text", [*notes, *session_notes(result)]
     at = 1e3 * in_base(map_.region.problem, map_.q, map_.region.marker)
-    frame = "" if box is None else " The frame is the box of the requirement."
     drawn = []
     for view, (across, up) in plot.VIEWS.items():
         wide, tall = np.ptp(at[:, across]), np.ptp(at[:, up])
@@ -269,13 +271,13 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
 def _parameters(content: Content) -> Iterator[Block]:
     result = content.result
     free = result.problem.parameters.free
-    half = np.full(len(result.x), np.nan)
+    half, factor = np.full(len(result.x), np.nan), 0.0
     note = result.no_intervals
     head = ["parameter", "nominal", "identified", "deviation", "U", "tolerance"]
     with contextlib.suppress(InputError):
         uncertainty = Uncertainty(result)
-        half = uncertainty.expanded
-        k = f"k = {uncertainty.coverage_factor:.2f}"
+        half, factor = uncertainty.expanded, uncertainty.coverage_factor
+        k = f"k = {factor:.2f}"
         head[4] = f"U ({k})"
         t = f"Student's t with {result.noise_dof:.0f} effective degrees of freedom"
         note = f"U = k u is the expanded uncertainty ({k}, 95 %, {t}), from measurement noise and prior."
@@ -286,7 +288,7 @@ def _parameters(content: Content) -> Iterator[Block]:
     own = free.take(np.flatnonzero(~free.of_curves))
     bounds = own.rows({"U": half[~free.of_curves], "tolerance": tolerance[~free.of_curves]})
     for (name, unit, *figures, _), bound in zip(words.columns(result)[1], bounds, strict=True):
-        edge = ", at its bound" if bound["parameter"] in at_bound else ""
+        edge = ", at its bound" * (bound["parameter"] in at_bound)
         expanded = "" if bound["U"] is None else f"±{bound['U']:.{words.decimals(bound['U'] / 2)}f}"
         allowed = "" if bound["tolerance"] is None else f"±{bound['tolerance']:.4g}"
         rows.append([f"{name} [{printed(unit)}]{edge}", *figures, expanded, allowed][:columns])
@@ -316,7 +318,6 @@ def _parameters(content: Content) -> Iterator[Block]:
     yield "heading", "Transmission errors of the joints"
     yield "text", ["Actual joint angle: the controller's plus this error, which is unknown outside the measured range."]
     yield "table", Table("Within the measured range", *words.curve_columns(result))
-    factor = Uncertainty(result).coverage_factor if np.isfinite(curves[0].standard).all() else 0.0
     largest = max(float(np.max(np.abs(each.error) + factor * np.nan_to_num(each.standard))) for each in curves)
     drawn = []
     for each in curves:
@@ -337,7 +338,7 @@ def _diagnostics(content: Content) -> Iterator[Block]:
         yield "figures", [_error_figure(result, "identification", result.problem.data)]
     for name, data in summary.sets(result).items():
         what, vectors = summary.signed_errors(result, data)
-        for i, axis in enumerate("xyz" if len(vectors["after"]) else ""):
+        for i, axis in enumerate("xyz" * (len(vectors["after"]) > 0)):
             means = [f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values()]
             signed.append([f"{name}, {axis}", *means])
     if signed:
@@ -389,11 +390,11 @@ def _provenance(content: Content) -> Iterator[Block]:
     record = result.record
     robots = []
     for name, robot in result.problem.arms.items():
-        named = f"{name}: {robot.name}" if name else robot.name
-        robots.append(" - ".join(filter(None, [named, f"{robot.dof} joints", robot.source])))
+        named = filter(None, [name, robot.name])
+        robots.append(" - ".join(filter(None, [": ".join(named), f"{robot.dof} joints", robot.source])))
     facts = {
-        "Source": record.source or ("" if record.details else "not stated"),
-        "Measurements": "simulated" if record.simulated else "",
+        "Source": record.source or "not stated" * (not record.details),
+        "Measurements": "simulated" * record.simulated,
         "Robot": "; ".join(robots),
         "Formulation": f"{result.formulation.name}: {_formulation(result)}",
         "Made": record.made,
@@ -445,7 +446,7 @@ def _formulation(result: Calibration) -> str:
         return part or "a function of a script, not stored in the file"
 
     parts = definition(result.formulation)
-    over = "" if parts["penalty_over"] == "none" else f" over {term(parts['penalty_over'])}"
+    over = f" over {term(parts['penalty_over'])}" * (parts["penalty_over"] != "none")
     text = f"loss {term(parts['loss'])} of each {parts['loss_over']}, penalty {term(parts['penalty'])}{over}"
     return f"{text}, constraints: {', '.join(map(term, parts['constraints'])) or 'none'}"
 
@@ -466,8 +467,8 @@ def _regularization(content: Content) -> Iterator[Block]:
     yield "figures", [figure(partial(plot.l_curve, result), title, caption, L_CURVE_HEIGHT)]
     rows = []
     for rule, choice in chosen.items():
-        own = f"{rule} (chosen)" if rule == result.selector else rule
-        rows.append([own, f"{choice.weight:.3g}", choice.note or WHY.get(rule, "given")])
+        chosen_here = " (chosen)" * (rule == result.selector)
+        rows.append([rule + chosen_here, f"{choice.weight:.3g}", choice.note or WHY.get(rule, "given")])
     title = "Weights chosen by the selection rules from the identification data alone"
     yield "table", Table(title, ["selector", "weight", "criterion"], rows, prose=True)
 

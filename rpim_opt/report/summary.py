@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
@@ -10,7 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.text import counted, listed, table
 from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import accept, inconclusive, measured_workspace
+from rpim_opt.calibration.acceptance import Workspace, inconclusive
 from rpim_opt.calibration.held_out import excluded_by_fit, headline_errors, of_positions, sets
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -19,6 +20,7 @@ from rpim_opt.data.measurements.contact import known_distance, known_parallel, k
 from rpim_opt.problem.linear import RANK_TOLERANCE
 from rpim_opt.store.problem_file import FIELDS
 from rpim_opt.store.result_file import figures
+from rpim_opt.use.export import tested
 from rpim_opt.use.sessions import in_session, session_notes
 
 COLUMNS = ("rows", "mean", "RMS", "95th percentile", "max")
@@ -27,9 +29,8 @@ Unit = Literal["mm", "mrad"]
 
 def mm(value: float) -> str:
     """Return a length in mm with its significant digits."""
-    if value < 10:
-        return f"{value:.3f}"
-    return f"{value:.2f}" if value < 100 else f"{value:.0f}"
+    digits = (3, 2, 0)[bisect((10, 100), value)]
+    return f"{value:.{digits}f}"
 
 
 def error_rows(result: Calibration) -> list[dict[str, Any]]:
@@ -39,8 +40,8 @@ def error_rows(result: Calibration) -> list[dict[str, Any]]:
     for name, data in sets(result).items():
         for kind, at in _kinds(data).items():
             if kind not in (known_square.name, known_parallel.name):
-                what = f"{name}, {kind.replace('_', ' ')}" if several else name
-                dimension = "stated length" if kind == known_distance.name else "length"
+                what = name + f", {kind.replace('_', ' ')}" * several
+                dimension = {known_distance.name: "stated length"}.get(kind, "length")
                 rows += _both_models(result, what, data, dimension, np.array(at))
         if name == "identification" and result.flagged:
             flagged = {flag.label for flag in result.flagged}
@@ -113,20 +114,19 @@ def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None
     if not n:
         return ""
     equations, unknowns = result.program.model.equations, len(result.x)
-    few = f"; {equations} equations for {unknowns} parameters" if equations < unknowns else ""
+    few = f"; {equations} equations for {unknowns} parameters" * (equations < unknowns)
     where = {
         "held out": f"On {n} measurements that were held out",
         "used": f"On {n} measurements, which were used for identification at least in part,",
         "identification": f"On the {n} identification measurements (no validation data{few})",
     }.get(name, f"On {n} {name} measurements, not used for identification,")
-    what = "position error" if of_positions(result) else "error"
+    what = "position " * of_positions(result) + "error"
     ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
     change = f"rises from {mm(before['mean_mm'])} mm to {mm(after['mean_mm'])} mm"
     if mm(before["mean_mm"]) == mm(after["mean_mm"]):
         change = f"stays at {mm(after['mean_mm'])} mm"
     elif ratio > 1:
-        factor = f"{ratio:.1f}" if ratio < 10 else f"{ratio:.0f}"
-        change = f"{change.replace('rises', 'falls')}, by a factor of {factor}"
+        change = f"{change.replace('rises', 'falls')}, by a factor of {ratio:.{int(ratio < 10)}f}"
     sentence = f"{where} the mean {what} {change}."
     if not result.verdict.delivered:
         return f"Not delivered: do not use this robot before the points below are resolved. {sentence}"
@@ -144,13 +144,14 @@ def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None
     return sentence
 
 
-def delivered(result: Calibration) -> str:
-    """Return the verdict on a robot without an acceptance limit as a sentence; empty if it is not delivered."""
-    if not result.verdict.delivered:
-        return ""
+def conclusion(result: Calibration, found: Workspace | None) -> tuple[str, str]:
+    """Return the verdict on a robot without an acceptance limit, and it as a sentence; empty if it is not delivered."""
+    if doubt := inconclusive(result, found):
+        return "inconclusive", doubt
+    text = "Delivered: the fit gives no reason against using this robot; no acceptance limit is stated."
     if result.verdict.caution:
-        return "Delivered under a condition: check the condition below before using this robot."
-    return "Delivered: the fit gives no reason against using this robot; no acceptance limit is stated."
+        text = "Delivered under a condition: check the condition below before using this robot."
+    return "accepted", text * result.verdict.delivered
 
 
 def identifiability(result: Calibration) -> str:
@@ -159,9 +160,9 @@ def identifiability(result: Calibration) -> str:
     parameters = ~result.problem.parameters.free.of_curves
     s = np.linalg.svd(model.qr_factor[:-1, :-1][:, parameters], compute_uv=False)
     rank, count = int(np.sum(s > RANK_TOLERANCE * s[0])), int(parameters.sum())
-    apart = "" if parameters.all() else ", without the transmission errors of the joints"
+    apart = ", without the transmission errors of the joints" * (count < len(parameters))
     others = " The others enlarge standard deviations of parameters, not those of predicted measurements."
-    others = others if rank < count else ""
+    others *= rank < count
     return f"{rank} of {count} parameter combinations are identifiable from {model.equations} equations{apart}.{others}"
 
 
@@ -207,13 +208,15 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         for method, mean in methods.items():
             errors.append({"what": f"{name}, published: {method}", "mean_mm": mean, "printed": True})
     lacking = judged(result)
-    accepted = None if record.requirement is None else accept(result)
-    uncertainty = measured_workspace(result) if accepted is None else None  # an acceptance test states it, too
-    said = "" if accepted is None else accepted.caution
-    doubt = inconclusive(result, uncertainty)
-    verdict = "" if accepted else doubt or delivered(result)
+    accepted, found = tested(result)
+    concluded, verdict = conclusion(result, found)
+    region, said = [], ""
+    if accepted is not None:  # which states the uncertainty, too
+        concluded, verdict, said = accepted.verdict, "", accepted.caution
+    elif found is not None:
+        region = [f"{found.summary}; region: {found.requirement.where}."]
     remarks = [
-        *([] if uncertainty is None else [f"{uncertainty.summary}; region: {uncertainty.requirement.where}."]),
+        *region,
         *words.weight_lines(result),
         identifiability(result),
         words.noise_sentence(result),
@@ -222,7 +225,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         nominal_note(result),
         *(text for text in words.underdetermined(result) if text not in said),
         *warnings(result),
-        *([result.message] if result.converged else []),
+        *[result.message] * result.converged,
     ]
     return {
         **figures(result),
@@ -237,7 +240,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "lack_of_fit": lacking and lacking.content(),
         "details": dict(record.details),
         "acceptance": accepted and {**accepted.content(), "text": accepted.sentences()},
-        "conclusion": accepted.verdict if accepted else "inconclusive" if doubt else "accepted",
+        "conclusion": concluded,
     }
 
 

@@ -138,7 +138,7 @@ def compare(
         "Problems": asked,
         "Methods": compared,
         "Held out": ways,
-        "Configurations": ["all" if count is None else str(count) for count in numbers_drawn],
+        "Configurations": [str(count or "all") for count in numbers_drawn],
         "Seeds": map(str, numbered),
         "Metrics": figured,
         "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
@@ -207,7 +207,7 @@ class Comparison:
         The metric is a column of which less is better, by default the first; the reference a method's label, by default
         the first one that has figures. InputError for an unknown metric or method, or where nothing has figures.
         """
-        metric = self.metric if metric is None else metric
+        metric = metric or self.metric
         ranked = [name for name in self.metrics if name != COVERED]
         if metric not in ranked:
             raise InputError("metric", f"'{metric}'", f"one of which less is better: {choices(metric, ranked)}")
@@ -223,7 +223,7 @@ class Comparison:
         for method in with_figures:
             own = of[method]
             count = sum(row["method"] == method for row in self.rows)
-            logs = {pair: _logarithm(own.get(pair)) - _logarithm(other.get(pair)) for pair in own.keys() | other.keys()}
+            logs = {pair: _logarithm(own, pair) - _logarithm(other, pair) for pair in own.keys() | other.keys()}
             wins = sum(log < -TIE for log in logs.values())
             losses = sum(log > TIE for log in logs.values())
             ratio = interval({pair: logs[pair] for pair in own if pair in other}, self.drawn)
@@ -329,8 +329,8 @@ class Summary:
     def header(self) -> tuple[str, ...]:
         """The column names."""
         over = f"over {self.reference}"
-        columns = ("method", f"median {self.metric}", "worst", over, "95 % interval", "better/tie/worse")
-        return (*columns, "no result") if any(each.missing for each in self.standings) else columns
+        columns = ("method", f"median {self.metric}", "worst", over, "95 % interval", "better/tie/worse", "no result")
+        return columns[: len(columns) - (not any(each.missing for each in self.standings))]
 
     def cells(self) -> list[list[str]]:
         """Return the table's rows as text."""
@@ -338,7 +338,7 @@ class Summary:
         for each in self.standings:
             interval = ""
             if each.low is not None and each.high is not None:
-                interval = f"{three_digits(each.low)} to {three_digits(each.high)}{' *' if each.different else ''}"
+                interval = f"{three_digits(each.low)} to {three_digits(each.high)}{' *' * each.different}"
             ratio = "" if each.ratio is None else three_digits(each.ratio)
             against = [ratio, interval, f"{each.wins}/{each.ties}/{each.losses}"]
             if each.method == self.reference:
@@ -356,9 +356,9 @@ class Summary:
         return html_table(self.header, self.cells(), self.notes)
 
 
-def _logarithm(figure: float | None) -> float:
+def _logarithm(known: Mapping[Pair, float], pair: Pair) -> float:
     """Return the logarithm of a figure, infinite without one; one of zero is as good as a rounding error."""
-    return math.inf if figure is None else math.log(max(figure, TINY))
+    return math.log(max(known.get(pair, math.inf), TINY))
 
 
 def figures(rows: Rows, metric: str) -> dict[str, dict[Pair, float]]:
@@ -420,7 +420,7 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
     else:
         scope = "these problems alone, with other seeds or folds"
     if compared:
-        several = " They are not corrected for multiple comparisons." if compared > 1 else ""
+        several = " They are not corrected for multiple comparisons." * (compared > 1)
         yield f"Intervals refer to {scope} (bootstrap, {CONFIDENCE:.0%}); * excludes 1.{several}"
     elif len(standings) > 1:
         yield f"There are no intervals: fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one."
@@ -432,7 +432,7 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         if row["reason"]:
             without.setdefault((row["method"], row["status"], row["reason"]), []).append(row["problem"])
     for (method, status, reason), missing in without.items():
-        where = f" ({listed(list(dict.fromkeys(missing)), 4)})" if len(missing) < every[method] else ""
+        where = f" ({listed(list(dict.fromkeys(missing)), 4)})" * (len(missing) < every[method])
         count = f"{len(missing)} of {every[method]} replicates{where}"
         yield f"{method}: {status}, {count}. {reason[:1].upper()}{reason[1:]}"
 

@@ -287,7 +287,7 @@ def _coverage(fitted: Fitted) -> float | None:
     if fitted.result is None:
         return None
     share = held_out_errors(fitted.result, fitted.held_out).coverage
-    return None if share is None else 100 * share
+    return share and 100 * share
 
 
 METRICS: dict[str, Callable[[Fitted], float | None]] = {

@@ -37,6 +37,8 @@ NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
 FILE = "study.py"  # the study of a folder
 MOST_FILES = 10_000  # of the files beside a study, each of which is read before its replicates are resumed
 REPLICATES = "replicates"
+PICTURES: dict[str, dict[str, Any]] = {"svg": {"Date": None}, "png": {}}
+"""Formats of figures, and what is written into them besides: without the time the same file for the same figure."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,8 @@ def find_study(name: str | Path) -> Path:
     """Return the file of a path, of a folder with ``study.py``, or of a name in the checkout or the current folder."""
     known = {path.stem: path for path in sorted(STUDIES.glob("*.py"))}
     text = str(name)
-    places = [text, f"{text}/{FILE}", f"{text}.py", f"studies/{text}.py", f"studies/{text}/{FILE}"]
-    for place in [known[text]] if text in known else map(Path, places):
+    names = f"{text}/{FILE}", f"{text}.py", f"studies/{text}.py", f"studies/{text}/{FILE}"
+    for place in [known.get(text, Path(text)), *map(Path, names)]:
         if place.is_file():
             return place.resolve()
     accepted = f"a Python file, or a folder with {FILE}"
@@ -87,8 +89,7 @@ def find_study(name: str | Path) -> Path:
 
 def _label(path: Path, quick: bool = False) -> str:
     """Return the name of a study: its file, or its folder where that holds ``study.py``."""
-    name = path.parent.name if path.name == FILE else path.stem
-    return f"{name}-quick" if quick else name
+    return {FILE: path.parent.name}.get(path.name, path.stem) + "-quick" * quick
 
 
 @lru_cache(maxsize=8)
@@ -195,7 +196,7 @@ def _replicate(
     files = files_of(path, study)
     # what makes them is what is here now, whatever becomes of it meanwhile
     name = _label(path) if path.parent == STUDIES else path.name
-    source = f"`rpim-opt study {name}{' --quick' if quick else ''}`, {file_state(path)}, with {package_state()}"
+    source = f"`rpim-opt study {name}{' --quick' * quick}`, {file_state(path)}, with {package_state()}"
     digest = sha256(repr(sorted(files.items())).encode()).hexdigest()[:SHORT]
     known = f"{len(files)} files in its folder or named by it have SHA-256 {digest}; others that it reads are not known"
     made = f"Made by {source}: {len(cases)} replicates, {versions()}. {known}."
@@ -223,12 +224,12 @@ def write(folder: Path, question: str, report: Report, made: str, replicates: Ma
     pictures = [f"![{title}]({title}.svg)\n" for title in report.figures]
     text = "\n".join([f"# {question}", "", report.text.strip(), "", *pictures, made])
     files = {"README.md": f"{text}\n".encode(), "metrics.json": json_text(dict(report.metrics)).encode(), **replicates}
-    for (title, figure), kind in product(report.figures.items(), ("svg", "png")):
+    for (title, figure), (kind, metadata) in product(report.figures.items(), PICTURES.items()):
         from matplotlib import rc_context  # which nothing but a figure needs
 
         stream = io.BytesIO()
         with rc_context({"svg.hashsalt": title}):  # the same file for the same figure
-            figure.savefig(stream, format=kind, metadata={"Date": None} if kind == "svg" else None)
+            figure.savefig(stream, format=kind, metadata=metadata)
         files[f"{title}.{kind}"] = stream.getvalue()
     write_files({folder / name: content for name, content in files.items()})
 
@@ -385,7 +386,7 @@ def commit(*paths: Path) -> str:
         return "in no repository"
     if "??" in {line[:2] for line in changes.splitlines()}:
         return f"{described}, untracked"
-    return f"{described}, dirty" if changes else described
+    return described + ", dirty" * bool(changes)
 
 
 def provenance() -> dict[str, str]:

@@ -167,14 +167,17 @@ class Compensation:
 
     def _left(self, row: int) -> str:
         """Return the error of a row, its U where that counts, and the joints at a limit."""
-        error = f"error {1e3 * self.position_error[row]:.3f} mm"
-        error += f", U {1e3 * EXPANDED * self.std[row]:.3f} mm" if self.status[row] == ABOVE else ""
-        error += f", {1e3 * self.orientation_error[row]:.3f} mrad" if self.orientation_error[row] > REACHED else ""
+        figures = {
+            f"error {1e3 * self.position_error[row]:.3f} mm": True,
+            f"U {1e3 * EXPANDED * self.std[row]:.3f} mm": self.status[row] == ABOVE,
+            f"{1e3 * self.orientation_error[row]:.3f} mrad": self.orientation_error[row] > REACHED,
+        }
+        left = [text for text, counts in figures.items() if counts]
         low, high = self.robot.limits.T
         for i in np.flatnonzero((self.q[row] <= low) | (self.q[row] >= high)):
             unit, si = display(self.robot.joint_dimensions[i])
-            error += f", joint {self.robot.joint(i)} at its limit of {self.q[row, i] / si:.6g} {unit}"
-        return error
+            left.append(f"joint {self.robot.joint(i)} at its limit of {self.q[row, i] / si:.6g} {unit}")
+        return ", ".join(left)
 
     def _largest_corrections(self) -> dict[str, float]:
         joints = joint_columns(self.robot.joint_dimensions)
@@ -206,7 +209,7 @@ class Compensation:
             "note": self.note,
             "point": self.point,
             "source": self.source,
-            "limit_mm": 1e3 * self.limit if np.isfinite(self.limit) else None,
+            "limit_mm": 1e3 * self.limit,
         }
 
     def csv(self) -> str:
@@ -291,11 +294,13 @@ def compensate(
     """
     arm = pick(result.problem.arms, robot, "robot")
     result = in_session(result, robot)
-    verdict = accept(result).on(result.verdict) if result.record.requirement else result.verdict
+    verdict, permitted = result.verdict, np.inf
+    if requirement := result.record.requirement:
+        verdict, permitted = accept(result).on(verdict), requirement.limit
     notes = verdict.require(despite_verdict), result.no_intervals, *session_notes(result, robot)
     targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation is not False)
     if limit is None:
-        limit = result.record.requirement.limit if result.record.requirement else np.inf
+        limit = permitted
     if not largest >= SMALLEST:
         raise InputError("largest", f"{largest}", f"a correction of at least {SMALLEST:g}")
     oriented = orientation is not False and (targets.poses is None or targets.poses.shape[1] == 7)
@@ -352,11 +357,12 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
     choice = orientation is None and cell.kind is pose
     aims = on_all_cores(cell.aim, blocks)
     every = range(len(blocks))
-    # a row that is turned alone would be turned against the others
-    vague = sum(on_all_cores(lambda i: cell.vague(blocks[i], aims[i]), every)) if choice else 0
+    vague, why = 0, ""
+    if choice:  # a row that is turned alone would be turned against the others
+        vague = sum(on_all_cores(lambda i: cell.vague(blocks[i], aims[i]), every))
+        why = " Orientations of all targets are corrected."
     parts = on_all_cores(lambda i: cell.corrected(blocks[i], aims[i], largest, not vague, choice), every)
     fields: dict[str, Any] = {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
-    why = " Orientations of all targets are corrected." if choice else ""
     if vague:
         why = (
             f" Orientations are not corrected: those of {vague} of {len(targets.label)} targets are known no better "
@@ -383,23 +389,21 @@ def tool_uncertainty(result: Calibration, q: Array, tool: Array | None, marker: 
 
 def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
     """Return the targets as labelled arrays; InputError for what does not fit."""
-    rows = stated.q if stated.poses is None else stated.poses
-    if rows is None:
+    given = {name: rows for name, rows in stated._asdict().items() if rows is not None and name != "label"}
+    if not given.keys() & {"q", "poses"}:
         raise InputError("targets", "neither joint values nor poses", "q, poses, or both")
-    N = len(np.atleast_1d(rows))
-    q, poses, torque = stated[1:4]
-    shape = max(N, 1), robot.dof
-    q = None if q is None else finite_numbers("q", q, shape)
-    torque = None if torque is None else finite_numbers("torque", torque, shape)
-    poses = None if poses is None else finite_numbers("poses", poses, (shape[0], 7), (shape[0], 3))
-    if poses is not None and poses.shape[1] == 7:
+    N = len(np.atleast_1d(given.get("poses", stated.q)))
+    count = max(N, 1)
+    shapes = {"q": [(count, robot.dof)], "torque": [(count, robot.dof)], "poses": [(count, 7), (count, 3)]}
+    given = {name: finite_numbers(name, rows, *shapes[name]) for name, rows in given.items()}
+    if "poses" in given and given["poses"].shape[1] == 7:
         try:
-            poses = pose.prepare(poses)[:, : 7 if orientation else 3]
+            given["poses"] = pose.prepare(given["poses"])[:, : 7 if orientation else 3]
         except RowError as error:
             raise InputError(f"poses, {error.where}", error.found, error.accepted) from None
     if len(stated.label) not in (0, N):
         raise InputError("label", f"{len(stated.label)} labels", f"{N}, one per row")
-    return Targets(stated.label or tuple(str(i) for i in range(1, N + 1)), q, poses, torque)
+    return stated._replace(label=stated.label or tuple(str(i) for i in range(1, N + 1)), **given)
 
 
 # --- the controller's robot beside the identified one ------------------------------------------------------
@@ -432,20 +436,22 @@ class _Cell:
         every[whole.identified] = result.x
         x = every[whole.places_of(which)]
         known = reflectors(p.names)
-        if tool is not None:
-            marker = known[0]
-        elif marker not in known:
-            found = f"'{marker}'" if marker else "none"
+        if tool is None and marker not in known:
+            found = {"": "none"}.get(marker, f"'{marker}'")
             named = choices(marker, [m or "no marker" for m in known])
             raise InputError("--marker", found, f"{named}, or a controller's TCP by --tool")
+        if tool is not None:
+            marker = known[0]
         prefix = tool_prefix(marker)
         at = p.frame(prefix)
-        place = p.values(x)[at] if tool is None else finite_numbers("tool", tool, (6,))
-        self.point = f"Target point: the stated tool, at {placed(place)} in the flange frame."
         if tool is None:
-            how = "as identified, " if p.identified[at].any() else ""
+            place = p.values(x)[at]
+            how = "as identified, " * bool(p.identified[at].any())
             self.point = f"Target point: the reflector, {how}at {placed(place)} in the flange frame"
             self.point += "; for the controller's TCP state --tool."
+        else:
+            place = finite_numbers("tool", tool, (6,))
+            self.point = f"Target point: the stated tool, at {placed(place)} in the flange frame."
         p = replace(p, nominal=p.nominal.copy(), identified=p.identified.copy())
         p.nominal[at], x[at] = place, 0.0
         p.identified[at] &= tool is None
@@ -477,8 +483,10 @@ class _Cell:
         """Return the uncorrected commands of some targets, and what these miss."""
         _, q, poses, torque, payload = targets
         N = len(targets.label)
-        borne = [] if torque is None else [torque @ np.linalg.inv(self.robot.joint_map)]
-        load = np.hstack([np.empty((N, 0)), *borne, *([] if payload is None else [payload[:, None]])])
+        if torque is not None:
+            torque = torque @ np.linalg.inv(self.robot.joint_map)
+        borne = [each.reshape(N, -1) for each in (torque, payload) if each is not None]
+        load = np.hstack([np.empty((N, 0)), *borne])
         beside = np.full(N, np.nan)
         if poses is None:
             commands = np.asarray(q)
@@ -508,7 +516,7 @@ class _Cell:
         reached = is_reached(missed, counts)
         wanted = np.where(turning | (np.arange(target.shape[1]) < 3), target, pose_before)
         due = np.where(reached[:, None] & (turning | (np.arange(k) < 3)), before - missed, 0.0)
-        W = counts if turning else counts * FIRST[:k]
+        W = counts * np.where(turning, 1.0, FIRST[:k])
         # P = V diag(p) V' of W J = U diag(s) V', see `compensate`
         U, s, Vt = np.linalg.svd(W @ J, full_matrices=True)
         some = s.shape[1]
@@ -528,7 +536,7 @@ class _Cell:
             there = load[first], wanted[first], commands[first], limits[:, first], counts[first] * FIRST, still[None]
             corrected[first], left[first], active[first] = nearest(self.identified, *there)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        met = is_reached(left if turning else left * KEPT[:k], counts)
+        met = is_reached(left * np.where(turning, 1.0, KEPT[:k]), counts)
         cases = {"ok": met, "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status, "there": pose_before[:, :3]}
@@ -612,8 +620,8 @@ class _Cell:
 
 def norms(error: Array) -> tuple[Array, Array]:
     """Return the norms of position and orientation errors (N, 3 or 6); NaN where there is no orientation."""
-    angle = np.linalg.norm(error[:, 3:], axis=1) if error.shape[1] > 3 else np.full(len(error), np.nan)
-    return np.linalg.norm(error[:, :3], axis=1), angle
+    whole = np.pad(error, ((0, 0), (0, 6 - error.shape[1])), constant_values=np.nan)
+    return np.linalg.norm(whole[:, :3], axis=1), np.linalg.norm(whole[:, 3:], axis=1)
 
 
 def is_reached(error: Array, W: Array) -> np.ndarray:

@@ -23,7 +23,8 @@ from rpim_opt.basics.text import counted, joined, listed, percent
 from rpim_opt.basics.units import numeral
 from rpim_opt.bayes.model_selection import CONDITIONS
 from rpim_opt.bayes.prior_terms import prior_penalty
-from rpim_opt.calibration.acceptance import accept, inconclusive, measured_workspace
+from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
+from rpim_opt.calibration.held_out import sets
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import transmission_errors
@@ -92,7 +93,7 @@ def identified(result: Calibration, marker: str | None = None, robot: str = "") 
     if extras:
         accepted = "MDH parameters, base and tool: `export_files` fits these alone, `compensate` uses all parameters"
         raise InputError("the calibration", listed(extras, 6), accepted)
-    prefix = tool_prefix(reflectors(p.names)[0] if marker is None else marker)
+    prefix = tool_prefix(marker or reflectors(p.names)[0])
     if prefix + "x" not in of:
         raise InputError("marker", f"'{marker}'", "a reflector of the calibration")
     tool = np.array([of[prefix + c] for c in FRAME])
@@ -180,7 +181,8 @@ def export_files(
         writers.append((target, partial(write, source)))
     writers += [(Path(target), write) for target, write in made if target]
     writers = [(to, lambda path, write=write: [*of_geometry, *(write(path) or ())]) for to, write in writers]
-    writers += [(Path(corrections), partial(_write_joint_corrections, whole))] if corrections else []
+    if corrections:
+        writers.append((Path(corrections), partial(_write_joint_corrections, whole)))
     if not writers:
         options = "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections"
         raise InputError("export", "nothing to write", f"{options}, one or several")
@@ -190,19 +192,24 @@ def export_files(
     return Exported([target for target, _ in writers], notes, undecided)
 
 
+def tested(result: Calibration) -> tuple[Acceptance | None, Workspace | None]:
+    """Return the acceptance test of a result that has a requirement, and the workspace of the test or of the result."""
+    if result.record.requirement is None:
+        return None, measured_workspace(result)
+    accepted = accept(result)
+    return accepted, accepted.workspace
+
+
 def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tuple[str, list[str], list[str], bool]:
     """Return notes for every file and of the geometry, remarks, whether that is inconclusive; or raise NotDelivered."""
-    accepted = accept(whole) if whole.record.requirement else None
-    found = accepted.workspace if accepted else measured_workspace(whole)
-    verdict, doubt = alone.verdict, inconclusive(whole, found)
-    remarks = list(filter(None, [whole.no_intervals]))
+    accepted, found = tested(whole)
+    verdict, said = alone.verdict, {"inconclusive": inconclusive(whole, found)}
     if accepted:
-        verdict = accepted.on(verdict)
-        doubt = accepted.summary if accepted.verdict == "inconclusive" else ""
-        remarks += [accepted.summary] if accepted.verdict == "accepted" else []
-    undecided = bool(doubt) and verdict.delivered
-    notes = [verdict.require(despite_verdict), doubt if undecided else "", *underdetermined(alone)]
-    note = " ".join(filter(None, notes))
+        verdict, said = accepted.on(verdict), {accepted.verdict: accepted.summary}
+    remarks = list(filter(None, [whole.no_intervals, said.get("accepted")]))
+    doubt = said.get("inconclusive", "") * verdict.delivered
+    undecided = bool(doubt)
+    note = " ".join(filter(None, [verdict.require(despite_verdict), doubt, *underdetermined(alone)]))
     if alone is whole or found is None:
         return note, [], remarks, undecided
     stays = np.linalg.norm(alone.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
@@ -214,8 +221,8 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
     )
     if accepted and bound > required.limit:
         undecided = True
-        of_geometry += f" It is above the limit of {1e3 * required.limit:g} mm"
-        of_geometry += "; only the whole model's is within it." if accepted.verdict == "accepted" else "."
+        within = "; only the whole model's is within it" * (accepted.verdict == "accepted")
+        of_geometry += f" It is above the limit of {1e3 * required.limit:g} mm{within}."
     remarks.append("Other points and the flange's orientation may be less certain: `compensate --tool` states their U.")
     return note, [of_geometry], remarks, undecided
 
@@ -259,8 +266,7 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         form = replace(result.formulation, penalty=lambda z: penalty(among @ z))
         alone = calibrate(bare(result.problem), form, weight=result.weight)
     alone = replace(alone, record=result.record, known={"causes": result.causes})  # the extension is no mistake
-    data = result.record.validation
-    where = "validation" if data is not None else "identification"
+    where, data = next(iter(sets(result).items()))
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))
     sentence = (
         f"Files cannot hold {listed(lost, 6)}: their geometry is from a separate fit to the same measurements, with "
@@ -346,33 +352,33 @@ def _write_urdf(
     if tip_measured and marker is None and len(known) > 1:
         raise InputError("--tip-measured", f"{len(known)} reflectors", f"--marker with one of {', '.join(known)}")
     of_base, of_tool, of_session = (any(n.startswith(f) for n in p.free.names) for f in ("base_", "tool_", "session_"))
-    base = arm.base if of_base and same_place(arm.base, own.base) else None
-    tool = arm.tool if of_tool and tip_measured else None
+    base, tool, at_tip = None, None, own.tool
     notes = []
     frame = "the instrument's frame" + (result.problem.session and f" of session '{result.problem.session}'")
-    if base is not None:
+    if of_base and same_place(arm.base, own.base):
+        base = arm.base
         notes.append(f"URDF: {root} is {frame}: the identified base, {placed(base)}, is in the first joint's origin.")
     elif of_base or of_session:
         at = placed(frame_numbers(numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))))
         notes.append(f"URDF: {root} is at {at} in {frame}: use this pose, not an earlier one.")
-    if tool is not None:
+    if of_tool and tip_measured:
+        tool, at_tip = arm.tool, None
         moved = 1e3 * np.linalg.norm(tool[:3] - own.tool[:3])
         notes.append(f"URDF: {tip} moved by {moved:.3g} mm to the reflector, {placed(tool)} in the flange frame.")
     elif of_tool:
         at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
         there = f"in its frame the reflector is at {at}; --tip-measured (tip_measured=True) moves it there"
         notes.append(f"URDF: {tip} keeps its pose from the file; {there}.")
-    notes += _tip_uncertainty(result, tip or "the tip link", own.tool if tool is None else None, marker, robot)
+    notes += _tip_uncertainty(result, tip or "the tip link", at_tip, marker or known[0], robot)
     return notes + write_urdf(source, arm.robot, target, root, tip, base, tool)
 
 
-def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: str | None, robot: str) -> list[str]:
+def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: str, robot: str) -> list[str]:
     """Return a sentence on the uncertainty of the tip link, at ``tool`` in the flange frame or at the reflector."""
     problem = result.problem.sample().alone(robot)
     blocks = [block for block in problem.data.blocks if block.q.shape[2] == problem.robot.dof]
     q = np.concatenate([block.q[:, 0] for block in blocks])
-    name = reflectors(problem.parameters.names)[0] if marker is None else marker
-    position, turn = (float(each.max()) for each in tool_uncertainty(result, q, tool, name, robot))
+    position, turn = (float(each.max()) for each in tool_uncertainty(result, q, tool, marker, robot))
     if not (position or turn):  # nothing identified moves it
         return []
     if not np.isfinite([position, turn]).all():
@@ -435,7 +441,7 @@ def _write_ur_calibration(result: Calibration, robot: str, marker: str | None, s
 
 def _of_controller(arm: RobotSetup) -> str:
     """Return the TCP and the Base that belong to a robot in files of Universal Robots, as PolyScope states poses."""
-    half = np.pi if (arm.robot.mdh[2:4, 1] > 0).all() else 0.0  # from ROS's base_link to Base
+    half = np.pi * bool((arm.robot.mdh[2:4, 1] > 0).all())  # from ROS's base_link to Base
     texts = []
     for T in (numeric_frame(arm.tool), numeric_frame(arm.base) @ numeric_link(theta=half)):
         lengths = (f"{name} {1e3 * value:z.3f}" for name, value in zip("XYZ", T[:3, 3], strict=True))

@@ -22,6 +22,7 @@ ANGLES = ("a", "b", "c")  # the standard's names of the rotations
 AXES = ("x", "y", "z")
 ROTATIONS = (("rx", "ry", "rz"), ANGLES, ("w", "p", "r"))
 """What the three angles of a table may be called; each is judged by itself, whichever axis it turns about."""
+DIMENSIONS = dict.fromkeys(AXES, "length") | {stem: "angle" for group in ROTATIONS for stem in group}
 ACCEPTED = "pose, x_mm, y_mm, z_mm; with a command command_x_mm, ...; with an orientation rx_deg, ry_deg, rz_deg"
 
 
@@ -52,7 +53,7 @@ class Performance(Tabled):
         """Return the figures [mm, mrad]."""
         return {
             "standard": "ISO 9283:1998, 7.2.1 and 7.2.2",
-            "accuracy_mm": None if self.accuracy is None else 1e3 * self.accuracy,
+            "accuracy_mm": self.accuracy and 1e3 * self.accuracy,
             "repeatability_mm": 1e3 * self.repeatability,
             "poses": self.poses,
             "notes": self._notes(),
@@ -66,10 +67,9 @@ class Performance(Tabled):
         rows = self.poses
         parts = []
         for unit in ("_mm", "_mrad"):
-            shown = [key for key in rows[0] if key.endswith(unit) and any(row[key] is not None for row in rows)]
+            shown = [key for key in rows[0] if key.endswith(unit) and rows[0][key] is not None]
             head = ["pose", "cycles", *(key.replace(unit, f" [{unit[1:]}]") for key in shown)]
-            cells = [["-" if row[key] is None else f"{row[key]:.4f}" for key in shown] for row in rows]
-            lines = [[row["pose"], str(row["cycles"]), *more] for row, more in zip(rows, cells, strict=True)]
+            lines = [[row["pose"], str(row["cycles"]), *(f"{row[key]:.4f}" for key in shown)] for row in rows]
             if shown:
                 parts.append(table(head, lines))
         return "\n".join([*parts, "ISO 9283:1998, 7.2.1 (AP) and 7.2.2 (RP).", *self._notes()])
@@ -126,10 +126,9 @@ def iso9283(
     """
     if not len(pose):
         raise InputError("iso9283", "no approach", "at least two per pose")
-    attained = _rows(position, len(pose), "positions")
-    commanded = None if command is None else _rows(command, len(pose), "commanded positions")
-    turned = None if angles is None else _rows(angles, len(pose), "angles")
-    commanded_turns = None if command_angles is None else _rows(command_angles, len(pose), "commanded angles")
+    stated = {"positions": position, "commanded positions": command}
+    stated |= {"angles": angles, "commanded angles": command_angles}
+    attained, commanded, turned, commanded_turns = (_rows(values, len(pose), what) for what, values in stated.items())
     poses = []
     for name in dict.fromkeys(pose):
         at = np.array([each == name for each in pose])
@@ -137,33 +136,34 @@ def iso9283(
             raise InputError(f"pose '{name}'", "one approach", f"two or more, {CYCLES} by the standard")
         barycentre = attained[at].mean(axis=0)
         length = np.linalg.norm(attained[at] - barycentre, axis=1)
-        row: dict[str, Any] = {"pose": name, "cycles": int(at.sum()), "AP_p_mm": None}
-        row |= dict.fromkeys(f"AP_{axis}_mm" for axis in AXES)
-        if commanded is not None:
-            offset = barycentre - _one_command(commanded[at], name, "position")
-            row["AP_p_mm"] = 1e3 * float(np.linalg.norm(offset))
-            row |= {f"AP_{axis}_mm": 1e3 * float(part) for axis, part in zip(AXES, offset, strict=True)}
-        row["RP_l_mm"] = 1e3 * float(length.mean() + 3 * length.std(ddof=1))
-        if turned is not None:
-            start = None if commanded_turns is None else _one_command(commanded_turns[at], name, "orientation")
-            from_start = turned[at] - (turned[at][0] if start is None else start)
-            beside = 1e3 * ((from_start + np.pi) % (2 * np.pi) - np.pi)
-            means = beside.mean(axis=0).tolist() if start is not None else [None] * 3
-            row |= {f"AP_{angle}_mrad": mean for angle, mean in zip(names, means, strict=True)}
-            spreads = beside.std(axis=0, ddof=1).tolist()
-            row |= {f"RP_{angle}_mrad": 3 * spread for angle, spread in zip(names, spreads, strict=True)}
-        poses.append(row)
+        offset = barycentre - _one_command(commanded[at], name, "position")
+        figures = {"AP_p_mm": np.linalg.norm(offset)}
+        figures |= {f"AP_{axis}_mm": part for axis, part in zip(AXES, offset, strict=True)}
+        figures["RP_l_mm"] = length.mean() + 3 * length.std(ddof=1)
+        if angles is not None:
+            start = _one_command(commanded_turns[at], name, "orientation")
+            from_start = turned[at] - np.where(np.isnan(start), turned[at][0], start)
+            beside = (from_start + np.pi) % (2 * np.pi) - np.pi
+            means = np.where(np.isnan(start), np.nan, beside.mean(axis=0))
+            figures |= {f"AP_{angle}_mrad": mean for angle, mean in zip(names, means, strict=True)}
+            spreads = 3 * beside.std(axis=0, ddof=1)
+            figures |= {f"RP_{angle}_mrad": spread for angle, spread in zip(names, spreads, strict=True)}
+        known = {key: None if np.isnan(value) else 1e3 * float(value) for key, value in figures.items()}
+        poses.append({"pose": name, "cycles": int(at.sum()), **known})
     return Performance(tuple(poses))
 
 
 def _one_command(values: Array, name: str, what: str) -> Array:
-    """Return the command of a pose (3,), which all its rows repeat."""
+    """Return the command of a pose (3,), which all its rows repeat; NaN without one."""
     if np.ptp(values, axis=0).max() > 1e-9:
         raise InputError(f"pose '{name}'", f"commands of more than one {what}", "one command per pose")
     return values[0]
 
 
-def _rows(values: Array, N: int, what: str) -> Array:
+def _rows(values: Array | None, N: int, what: str) -> Array:
+    """Return stated values (N, 3), or NaN."""
+    if values is None:
+        return np.full((N, 3), np.nan)
     array = finite_numbers(what, values, (N, 3))
     far = np.abs(array).max(axis=1) > LARGEST
     if far.any():
@@ -199,10 +199,10 @@ def read_approaches(source: Any, units: str = "") -> Performance:
         of = {"measured": attained, "wanted": commanded}.get(meaning.kind or "measured")
         if meaning.stem in ("configuration", "label"):
             poses.setdefault(meaning.stem, name)
-        elif of is not None and meaning.stem in {*AXES, *(stem for group in ROTATIONS for stem in group)}:
+        elif of is not None and meaning.stem in DIMENSIONS:
             if meaning.stem in of:
                 raise InputError("the header", f"'{of[meaning.stem][0]}' and '{name}'", "one of them")
-            dimension = "length" if meaning.stem in AXES else "angle"
+            dimension = DIMENSIONS[meaning.stem]
             unit = unit or stated.get(dimension, "")
             if not unit or UNITS[unit].dimension != dimension:
                 found = f"column '{name}' without a unit of {dimension}"

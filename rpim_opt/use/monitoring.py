@@ -90,15 +90,15 @@ class Monitoring:
 
     def content(self) -> dict[str, Any]:
         """Return the figures, and the chart's points [mm]."""
-        drift = self.drift
+        label: dict[int | None, str] = dict(enumerate(self.label))
         return {
             "drifts": self.drifts,
             "checks": len(self.label),
             "beyond": [self.label[i] for i in self.beyond],
-            "alarm": None if self.alarm is None else self.label[self.alarm],
-            "since": None if self.alarm is None else self.label[self._since(self.alarm)],
+            "alarm": label.get(self.alarm),
+            "since": label.get(self.since),
             "limit": self.limit,
-            "moved": None if drift is None else {**drift.content(), "label": self.label[drift.first]},
+            "moved": self.drift and {**self.drift.content(), "label": label[self.drift.first]},
             "mistake": self.mistake,
             "registered": self.registered,
             "rows": records(self._columns()),
@@ -116,12 +116,12 @@ class Monitoring:
         if self.beyond:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
             lines.append(f"Outside the prediction interval of a new reading: {listed(named, between='; ')}.")
-        if self.alarm is not None:
-            since = self._named(self._since(self.alarm))
-            lines.append(f"Cumulative sum above its limit at check {self._named(self.alarm)}, rising since {since}.")
+        if self.alarm is not None and self.since is not None:
+            at = self._named(self.alarm)
+            lines.append(f"Cumulative sum above its limit at check {at}, rising since {self._named(self.since)}.")
         if self.drift is not None:
             cause, first = self.drift.cause, self.drift.first
-            course = f"in one step before {self._named(first)}" if first else "before the first check"
+            course = {0: "before the first check"}.get(first, f"in one step before {self._named(first)}")
             if self.drift.steady:
                 course = "steadily from the first to the last check"
             lines.append(
@@ -140,19 +140,21 @@ class Monitoring:
         )
         return "\n".join([*lines, *filter(None, [self.registered])])
 
-    def _since(self, alarm: int) -> int:
-        """Return the first check that led to an alarm: after the last sum that was zero."""
-        zeros = np.flatnonzero(self.sums[: alarm + 1] == 0)
-        return int(zeros[-1]) + 1 if len(zeros) else 0
+    @property
+    def since(self) -> int | None:
+        """The first check that led to the alarm, after the last sum that was zero; None without an alarm."""
+        if self.alarm is None:
+            return None
+        return int(np.flatnonzero(np.append(0.0, self.sums[: self.alarm]) == 0)[-1])
 
     def _named(self, i: int) -> str:
         return f"{self.label[i]} ({self.times[i]})" if self.times else f"'{self.label[i]}'"
 
     def _columns(self) -> dict[str, Sequence[Any]]:
-        columns: dict[str, Sequence[Any]] = {"label": self.label, **({"time": self.times} if self.times else {})}
         figures = {"error_mm": 1e3 * self.error, "sigmas": self.sigmas, "allowed_sigmas": self.allowed}
         figures["sum"] = self.sums
-        return columns | {name: values.tolist() for name, values in figures.items()}
+        named = {"label": self.label, "time": self.times} | {name: values.tolist() for name, values in figures.items()}
+        return {name: cells for name, cells in named.items() if cells}
 
 
 def monitor(
@@ -184,7 +186,7 @@ def monitor(
         order = np.argsort(when, kind="stable")
         data = data.take(order)
         when = when[order]
-        times = tuple(times[i] for i in order) if times else ()
+        times = tuple(times[i] for i in order[: len(times)])
     # a place that is checked again and again is many configurations: one a visit
     visit = np.cumsum(np.diff(data.configuration, prepend=data.configuration[0]) != 0)
     if when is not None:

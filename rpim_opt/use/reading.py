@@ -72,7 +72,8 @@ def read_targets(
     known = reflectors(list(values))
     if tool is None:
         tool = [values[tool_prefix(marker if marker in known else known[0]) + axis] for axis in FRAME]
-    understanding = _understood(result, source, pose, options or TableOptions(), np.asarray(tool, dtype=float))
+    arm = RobotSetup(robot, tool=np.asarray(tool, dtype=float))
+    understanding = _understood(result, source, pose, options or TableOptions(), arm, targets=True)
     with in_file(source):
         targets = _targets(robot, understanding)
     angles = ("rx", "ry", "rz", "qw,")
@@ -98,11 +99,12 @@ def _targets(robot: Robot, understanding: Interpretation) -> Targets:
         raise InputError("the header", "rx, ry, rz in rad, which joint values would tell apart", accepted)
     if not joints and not positions:
         raise InputError("the header", "no targets", "columns q1_deg, ..., or x_mm, y_mm, z_mm, or both")
-    absent = [] if joints else list(joint_columns(robot.joint_dimensions))
-    absent += [] if positions else ["x_mm", "y_mm", "z_mm"]
+    absent = [*joint_columns(robot.joint_dimensions)] * (not joints) + ["x_mm", "y_mm", "z_mm"] * (not positions)
     columns |= dict.fromkeys(absent, [0.0] * len(next(iter(columns.values()))))
-    noise = {"position_mm": 1, "orientation_mrad": 1} if oriented else {"position_mm": 1}
-    data = read_data(columns, robot, noise, pose if oriented else position)
+    kind, noise = position, {"position_mm": 1}
+    if oriented:
+        kind, noise = pose, {"position_mm": 1, "orientation_mrad": 1}
+    data = read_data(columns, robot, noise, kind)
     block, *others = data.blocks
     if others:
         raise InputError("column marker", "several reflectors", "targets of one")
@@ -110,7 +112,9 @@ def _targets(robot: Robot, understanding: Interpretation) -> Targets:
         accepted = "none: joints are in the middle of their backlash"
         raise InputError("column approach1", "directions of approach", accepted)
     torque = None if block.torque is None else block.torque[:, 0]
-    return Targets(data.label, data.q if joints else None, block.y if positions else None, torque, block.payload)
+    stated = {"q": joints, "poses": positions}
+    absent = [name for name, there in stated.items() if not there]
+    return Targets(data.label, data.q, block.y, torque, block.payload)._replace(**dict.fromkeys(absent))
 
 
 class Measured(NamedTuple):
@@ -119,12 +123,12 @@ class Measured(NamedTuple):
     data: Dataset
     left_out: tuple[str, ...]
     notes: tuple[str, ...]
-    clock: tuple[str, tuple[str, ...]] | None  # name and cells of the column called time, timestamp or date
+    clock: tuple[str, tuple[str, ...]]  # name and cells of the column called time, timestamp or date, or none
 
     @property
     def when(self) -> Array | None:
         """The rows' times (N,) [s]; None without a column of them."""
-        return None if self.clock is None else seconds(*self.clock)
+        return seconds(*self.clock) if self.clock[0] else None
 
 
 def read_measurements(
@@ -157,7 +161,8 @@ def read_measurements(
     if not measurement and len(types) != 1:
         raise InputError("measurement", "several", choices("", types))
     calibrated = pick(types, measurement or next(iter(types)), "measurement")
-    understanding = _understood(result, source, calibrated, options or TableOptions())
+    arm = RobotSetup(robot)
+    understanding = _understood(result, source, calibrated, options or TableOptions(), arm)
     columns = understanding.columns
     stems = {split_unit(name)[0] for name in columns}
     kind = calibrated
@@ -172,9 +177,9 @@ def read_measurements(
     sigma = dict(zip(calibrated.components, np.sqrt(variance).tolist(), strict=True))
     units = {name: display(dimension) for name, dimension in kind.components.items()}
     noise = {f"{name}_{unit}": sigma[name] / si for name, (unit, si) in units.items()}
-    data = rows_of(understanding, columns, RobotSetup(robot), kind, noise)
-    name = time_column(understanding.raw)
-    clock = None if name is None else (name, tuple(str(cell) for cell in understanding.raw[name]))
+    data = rows_of(understanding, columns, arm, kind, noise)
+    name = time_column(understanding.raw) or ""
+    clock = name, tuple(str(cell) for cell in understanding.raw.get(name, ()))
     left_out = tuple(column for column in understanding.left_out if column.lower() != name)
     lost = re.compile(r"rows without|line \d|\d+ more lines")
     notes = [f"{each.file}: {note}" for each in understanding.tables for note in each.notes if lost.match(note)]
@@ -198,24 +203,22 @@ def _perhaps_radians(result: Calibration, understanding: Interpretation, q: Arra
 
 
 def _understood(
-    result: Calibration, source: Any, kind: Measurement, stated: TableOptions, tool: Array | None = None
+    result: Calibration, source: Any, kind: Measurement, stated: TableOptions, arm: RobotSetup, targets: bool = False
 ) -> Interpretation:
     """Return the content of tables, read as the calibration's own were; where that does not fit, by their headers.
 
-    They are measurements, or targets of a tool (6,).
+    They are measurements, or targets of the tool of an ``arm``.
     """
     sources = source if isinstance(source, list | tuple) else [source]
     reading = dict(result.record.reading)
     if not all(Path(str(each)).suffix.lower() in EXCEL for each in sources):
         reading.pop("sheet", None)
     options = TableOptions.stated({**reading, **stated.texts()})
-    targets = tool is not None
-    arm = RobotSetup(result.problem.robot, tool=np.zeros(6) if tool is None else tool, names=options.joints)
     try:
-        return interpret_tables(arm, sources, kind, options, targets)
+        return interpret_tables(replace(arm, names=options.joints), sources, kind, options, targets)
     except InputError as error:
         if error.where == "rx, ry, rz":  # which no other reading of the table answers
             raise
         with suppress(InputError):  # one that has our names already
-            return interpret_tables(replace(arm, names=()), sources, kind, stated, targets)
+            return interpret_tables(arm, sources, kind, stated, targets)
         raise

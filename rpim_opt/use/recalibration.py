@@ -130,8 +130,9 @@ class Update:
     @cached_property
     def lacking(self) -> str:
         """A sentence on an effect that the model lacks by the new rows, and what to do; empty without one."""
-        fit = judged(self.result)
-        return " ".join(line for line in fit.sentences() if TOGETHER in line) if fit else ""
+        if not (fit := judged(self.result)):
+            return ""
+        return " ".join(line for line in fit.sentences() if TOGETHER in line)
 
     def content(self) -> dict[str, Any]:
         """Return the figures [mm, deg], all causes, and the earlier calibrations."""
@@ -155,9 +156,9 @@ class Update:
     def _alternatives(self) -> str:
         """Return a sentence on other changes that the readings do not distinguish from those found; empty if none."""
         # a frame that moved explains as much as the link before or behind it (base_z as d1), with more parameters
-        least = self.changes[0].gain - AS_GOOD if self.changed else np.inf
-        rivals = [c for c in self.causes[1:] if self.changes and (c.probability > RIVAL or c.gain > least)]
-        if not rivals:
+        found = [cause.gain - AS_GOOD for cause in self.changes[:1] if self.changed]
+        rivals = [c for c in self.causes[1:] if c.probability > RIVAL or any(c.gain > least for least in found)]
+        if not (rivals and self.changes):
             return ""
         frames = [cause.name for cause in rivals if cause.kind == "frame"]
         remedy = "measure more."
@@ -168,18 +169,17 @@ class Update:
 
     def __str__(self) -> str:
         count = f"{self.readings} readings"
-        if self.changes:
-            verdict = "The robot has changed" if self.changed else "The robot has not changed, but readings are wrong"
-            lines = [f"{verdict}. With the previous calibration: {self.before}."]
-        elif self.before.likely:
-            lines = [f"No change of the robot is detectable from {count}: {self.before}."]
-        else:
-            lines = [f"{count} contradict the previous calibration: {self.before}."]
-        lines = [*filter(None, [self.registered]), *lines]
+        verdicts = {
+            "The robot has changed. With the previous calibration": self.changed,
+            "The robot has not changed, but readings are wrong. With the previous calibration": bool(self.changes),
+            f"No change of the robot is detectable from {count}": self.before.likely,
+            f"{count} contradict the previous calibration": True,
+        }
+        verdict = next(text for text, holds in verdicts.items() if holds)
+        lines = [*filter(None, [self.registered]), f"{verdict}: {self.before}."]
         for cause in self.changes:
-            end = ", excluded" if cause.kind == "reading" else ""
             figures = f"chi-squared falls by {three_digits(cause.gain)}, posterior probability {cause.probability:.2g}"
-            lines.append(f"  {cause.kind} {cause.name}: {figures}{end}.")
+            lines.append(f"  {cause.kind} {cause.name}: {figures}{', excluded' * (cause.kind == 'reading')}.")
         moved = [str(each) for each in self.moved if not (self.registered and each.name.startswith(BASE))]
         if moved:
             lines.append(f"Changed since then: {joined(moved)}.")
@@ -203,8 +203,8 @@ class Update:
             )
         rows = [[c.name, c.kind, three_digits(c.gain), f"{c.p_value:.2g}", f"{c.probability:.2g}"] for c in self.causes]
         head = ["may have changed", "kind", "chi-squared falls by", "p-value", "probability"]
-        verdict = [] if self.result.verdict.delivered else [str(self.result.verdict)]
-        return "\n".join([*lines, *verdict, "", table(head, rows[:SHOWN]), "", self.result.message])
+        refused = [str(self.result.verdict)] * (not self.result.verdict.delivered)
+        return "\n".join([*lines, *refused, "", table(head, rows[:SHOWN]), "", self.result.message])
 
 
 def update(
@@ -245,12 +245,14 @@ def update(
     free = problem.parameters.free
     released = _reset(result, data, free, reset)
     say("comparing with the previous calibration")
-    elsewhere = "" if released else _base_elsewhere(result, problem, prior_inflation)
+    elsewhere = ""
     base = tuple(name for name in free.names if name.startswith(registration(free, data)))
-    released = base if elsewhere else released
+    if not released:
+        elsewhere, released = _base_elsewhere(result, problem, base, prior_inflation)
     # a base that was reset may be anywhere: then it is registered again
     start = None if base and {*base} <= {*released} else previous_deviations(result, problem)
     changes: list[Cause] = []
+    most = {"reading": max(SPARED * len(data), 1)}
     first: tuple[tuple[Cause, ...], Fit] | None = None  # before anything is released
     while True:
         updated = _recalibrated(result, problem, released, prior_inflation, start)
@@ -261,7 +263,7 @@ def update(
         if cause is None:
             break
         alike = [each for each in changes if (each.kind == "reading") == (cause.kind == "reading")]
-        if len(alike) >= (max(SPARED * len(data), 1) if cause.kind == "reading" else MOST):
+        if len(alike) >= most.get(cause.kind, MOST):
             break
         say(f"releasing {cause.name}")
         changes.append(cause)
@@ -293,12 +295,14 @@ def update(
 
 def _reset(result: Calibration, data: Dataset, free: Parameters, reset: Sequence[str]) -> tuple[str, ...]:
     """Return the parameters that the earlier result does not describe; refuse the base beside sessions."""
+    if not reset:
+        return ()
     if any(map(of_session, free.names)) and (wrong := [each for each in reset if each.startswith(BASE)]):
         own = session_prefix(str(data.session[0]))
         known = any(name.startswith(own) for name in result.problem.parameters.free.names)
         accepted = f"'{own}*'" if known else "no --reset: a new session is registered by itself"
         raise InputError("update, reset", f"'{wrong[0]}', but every session has an offset of its own", accepted)
-    return tuple(np.array(free.names)[matching(free, reset, "update, reset")].tolist()) if reset else ()
+    return tuple(np.array(free.names)[matching(free, reset, "update, reset")].tolist())
 
 
 def _refuse_another_robot(result: Calibration, updated: Calibration, data: Dataset, base_reset: bool) -> None:
@@ -307,7 +311,7 @@ def _refuse_another_robot(result: Calibration, updated: Calibration, data: Datas
     missed = rms(updated.errors(data))
     if missed > STRANGE * float(np.nanmax(result.nominal_errors())):
         same = f"those of the same robot ({_robots(result)}) in the same units"
-        known = "" if base_reset else " and instrument's frame, or --reset with what moved (base_*)"
+        known = " and instrument's frame, or --reset with what moved (base_*)" * (not base_reset)
         found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
         raise InputError("the new measurements", found, same + known)
 
@@ -332,14 +336,11 @@ def _carried_on(record: Record, last: Earlier, source: str) -> Record:
     first_source = record.source.rpartition(BEFORE)[2]  # what is said of a file belongs to its own measurements
     return Record(
         title=f"{record.title.removesuffix(UPDATED)}{UPDATED}",
-        source=f"{source}{BEFORE}{first_source}" if first_source else source,
+        source=BEFORE.join(filter(None, [source, first_source])),
         excluded=dict.fromkeys(last.excluded, "far outside the prediction intervals of the previous calibration"),
         simulated=record.simulated,
         noise_assumed=record.noise_assumed,
-        details={
-            key: text if key in OF_ROBOT or text.endswith(OF_EARLIER) else text + OF_EARLIER
-            for key, text in record.details.items()
-        },
+        details={k: t.removesuffix(OF_EARLIER) + OF_EARLIER * (k not in OF_ROBOT) for k, t in record.details.items()},
         requirement=record.requirement,
         earlier=(*record.earlier, last),
         reading=record.reading,
@@ -362,23 +363,27 @@ def _robots(result: Calibration) -> str:
     return " and ".join(robot.name for robot in result.problem.arms.values())
 
 
-def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation: float) -> str:
-    """Say where the base is and was, if readings that are displaced together put it out of its place; empty else."""
+def _base_elsewhere(
+    result: Calibration, problem: CalibrationProblem, base: tuple[str, ...], inflation: float
+) -> tuple[str, tuple[str, ...]]:
+    """Say where the base is and was, if readings that are displaced together put it out of its place; empty else.
+
+    And return the parameters of the ``base`` that are released then.
+    """
     # evidence is linear in the deviations: of a base that turned far, it is none
-    free, data = problem.parameters.free, problem.data
-    place = registration(free, data)
-    base = [name for name in free.names if name.startswith(place)]
-    if not base or not displacement(result, problem.data, held_out_errors(result, problem.data))[0]:
-        return ""
+    data = problem.data
+    if not base or not displacement(result, data, held_out_errors(result, data))[0]:
+        return "", ()
     registered = _recalibrated(result, problem, base, inflation, None)
-    session = "" if place == BASE else str(data.session[0])
+    place = registration(problem.parameters.free, data)
+    session = str(data.session[0]) * (place != BASE)
     was, now = (np.array(frame_numbers(base_frame(each, "", session))) for each in (result, registered))
     if same_place(was, now):
-        return ""
+        return "", ()
     return (
         f"The instrument or the base moved: in the instrument's frame the base is at {placed(now)}, previously at "
         f"{placed(was)}. It was registered again, as with --reset '{place}*'."
-    )
+    ), base
 
 
 def _with_scales_of_motion(
@@ -534,8 +539,9 @@ def posterior_as_prior(
 def prior_widths(result: Calibration, problem: Source) -> Array:
     """Return the prior standard deviations (n,) [SI] of a problem's parameters before any calibration."""
     free = problem.parameters.free
-    learned = result.learned
-    stated = {} if learned is None else dict(zip(result.problem.parameters.free.names, learned.stated, strict=True))
+    if result.learned is None:
+        return default_widths(free)
+    stated = dict(zip(result.problem.parameters.free.names, result.learned.stated, strict=True))
     stated |= {name.rpartition("_")[2]: own for name, own in stated.items() if of_session(name)}  # of new ones, too
     keys = [name.rpartition("_")[2] if of_session(name) and name not in stated else name for name in free.names]
     scale = [stated.get(key, own) for key, own in zip(keys, free.scale, strict=True)]
@@ -617,11 +623,12 @@ def candidates(free: Parameters, data: Dataset, reset: Sequence[str] = ()) -> li
     for name, frame, curve in zip(free.names, free.of_frames, free.of_curves, strict=True):
         if name in reset or (of_session(name) and not name.startswith(place)):  # an earlier session is over
             continue
+        kinds = {"frame": frame, "transmission error": curve, "joint offset": is_joint_offset(name), "parameter": True}
+        kind = next(kind for kind, holds in kinds.items() if holds)
         if frame or curve:
-            kind = "frame" if frame else "transmission error"
             wholes.setdefault((name.rpartition("_")[0], kind), []).append(name)
         else:
-            causes.append(Cause(name, "joint offset" if is_joint_offset(name) else "parameter", (name,)))
+            causes.append(Cause(name, kind, (name,)))
     return causes + [Cause(*whole, tuple(names)) for whole, names in wholes.items()]
 
 

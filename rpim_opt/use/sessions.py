@@ -33,7 +33,7 @@ def in_session(result: Calibration, robot: str = "") -> Calibration:
     True
     """
     problem = result.problem
-    names = [name for name, again in _sessions(result, robot).items() if again] if robot in problem.arms else []
+    names = [name for name, again in _sessions(result, robot).items() if again and robot in problem.arms]
     if not names or problem.session or not problem.keeps_rows:
         return result
     views = [replace(result, problem=replace(problem, session=name)) for name in names]
@@ -64,9 +64,10 @@ def registered_again(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
         try:
             data, motion = registered(result, data, places == name)
         except InputError as error:
-            where = f"--register{f', session {name!r}' if name else ''}, {error.where}"
-            raise InputError(where, error.found, error.accepted) from None
-        motions.append(f"{f'session {name!r} was' if name else 'the measurements were'} {motion}")
+            where = filter(None, ["--register", name and f"session {name!r}", error.where])
+            raise InputError(", ".join(where), error.found, error.accepted) from None
+        moved = {"": "the measurements were"}.get(name, f"session {name!r} was")
+        motions.append(f"{moved} {motion}")
     return data, f"Registered again: {listed(motions, between='; ')}."
 
 
@@ -82,13 +83,13 @@ def _slopes(view: Calibration, robot: str) -> Array:
     """Return the derivatives (N, 3, n) of positions in the frame of a view's session at measured configurations."""
     problem = view.problem.sample()
     blocks = [block for block in problem.data.blocks if block.robot == robot]
-    few = slice(None, None, -(-sum(len(block.row) for block in blocks) // SOME))
+    step = -(-sum(len(block.row) for block in blocks) // SOME)
     slopes = []
-    for block in blocks:
-        torque = None if block.torque is None else block.torque[few, 0]
-        payload = None if block.payload is None else block.payload[few]
-        columns = {name: values[few] for name, values in block.columns.items()}
-        there = problem.measuring(block.q[few, 0], position, block.markers[0], torque, payload, columns, robot)
+    for few in [block.take(np.arange(0, len(block.row), step), block.row[::step]) for block in blocks]:
+        torque = few.torque
+        if torque is not None:
+            torque = torque[:, 0]
+        there = problem.measuring(few.q[:, 0], position, few.markers[0], torque, few.payload, few.columns, robot)
         slopes.append(there.jacobian(view.x).reshape(len(there.data), 3, -1))
     return np.concatenate(slopes)
 
@@ -109,10 +110,9 @@ def session_notes(result: Calibration, robot: str = "") -> list[str]:
         return []
     measured = _sessions(result, robot)
     names = sorted(measured, key=lambda name: (name != here, not measured[name]))
-    before = {name: "" if again else " (by rows before the update)" for name, again in measured.items()}
-    listed = [f"'{n}'{before[n]} {placed(frame_numbers(base_frame(result, robot, n)))}" for n in names[:FEW]]
-    more = f"; {len(names) - FEW} more in the result" if len(names) > FEW else ""
+    before = {name: " (by rows before the update)" * (not again) for name, again in measured.items()}
+    bases = [f"'{name}'{before[name]} {placed(frame_numbers(base_frame(result, robot, name)))}" for name in names]
     return [
         f"Positions and their U are in the instrument's frame of session '{here}'. Base of the DH table in the frame "
-        f"of sessions: {'; '.join(listed)}{more}."
+        f"of sessions: {listed(bases, FEW, '; ')}."
     ]

@@ -97,7 +97,7 @@ class Validation(HeldOut):
             figures["orientation, identified [mrad]"] = content["orientation"]
         rows = []
         for name, of in figures.items():
-            unit = "mm" if "mean_mm" in of else "mrad"
+            unit = next(iter(of)).rpartition("_")[2]
             rows.append([name, str(of["count"]), *(f"{of[f'{key}_{unit}']:.4f}" for key in ("mean", "rms", "max"))])
         errors = ["error [mm]", "rows", "mean", "RMS", "max"], rows
         return [errors, (HEADER, touch_rows(self.touched))] if self.touched else [errors]
@@ -154,7 +154,7 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
     touched = touch_errors(data, held.nominal, held.error)
     remarks += shared_rows(problem.data, data)
     moved, hint = moved_or_changed(result, data, held)
-    remarks += [hint] if hint else []
+    remarks += filter(None, [hint])
     if not result.verdict.delivered:
         remarks.append(f"The calibration is not delivered: {' '.join(result.verdict.reasons)}")
     if touched:
