@@ -11,7 +11,7 @@ from scipy.special import bdtrc, fdtri
 
 from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import joined, listed, percent
+from rpim_opt.basics.text import joined, listed, percent, three_digits
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.diagnosis import SLACK
@@ -29,10 +29,11 @@ from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors
-from rpim_opt.calibration.verdict import Verdict, ambiguous_deviation, refuse_misread
+from rpim_opt.calibration.verdict import Verdict, ambiguous_deviation, kept_rows, refuse_misread, residual_rms
 from rpim_opt.calibration.words import VAGUE, underdetermined
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut, Requirement
+from rpim_opt.problem.causes.residuals import NOISY
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import in_base, markers, within
 from rpim_opt.robot.parameters import of_session
@@ -225,8 +226,15 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
     )
     if any(map(of_session, result.problem.parameters.free.names)) and not result.problem.session:
         advice = _missing(result, nominal, found, 0.0)
+    size, ratio = residual_rms(result, kept_rows(result))["length"]
+    scatter = ""
+    if ratio > NOISY:
+        scatter = (
+            f"the readings scatter by {three_digits(1e3 * size)} mm RMS, {three_digits(ratio)} times the stated noise "
+            "(did the arm vibrate, or something shake the instrument? Measure again at rest), and "
+        )
     return (
-        f"Inconclusive: the median U over the region, {1e3 * found.median:.3f} mm, is above the error of the "
+        f"Inconclusive: {scatter}the median U over the region, {1e3 * found.median:.3f} mm, is above the error of the "
         f"nominal robot, {1e3 * nominal:.3f} mm RMS on the {name} rows. {advice}"
     )
 

@@ -27,13 +27,14 @@ from rpim_opt.problem.causes.misreadings import Better, better_interpretation, s
 from rpim_opt.problem.causes.positions import (
     better_interpretations,
     computed_columns,
+    computed_rows,
     odd_column,
     other_places,
     other_rows,
     single_rows,
     unrelated_rows,
 )
-from rpim_opt.problem.causes.residuals import MOVED, NOISY, NOTICED, SLIGHT, shown_by_residuals
+from rpim_opt.problem.causes.residuals import MOVED, NOISY, NOTICED, SLIGHT, another_robot, shown_by_residuals
 from rpim_opt.problem.causes.rows import (
     ANGULAR,
     REACH,
@@ -565,8 +566,13 @@ def _beside_a_good_fit(
     causes = list(filled_rows(ordered.data))  # which may fit
     if result.excluded is not None and len(problem.arms) == 1:
         by_result = [replace(part, robots=result.robot) for part in parts]
-        explained = (other_places, other_rows)
-        causes = first(*map(single_rows, parts), *(explain(part) for explain in explained for part in by_result))
+        apart = of_sessions(problem.on(result.excluded))
+        causes = first(
+            *map(single_rows, parts),
+            *map(computed_rows, apart),
+            *(explain(part) for explain in (other_places, other_rows) for part in by_result),
+            *(another_robot(part, result.robot) for part in apart),
+        )
     elif result.excluded is not None or not kept.all():
         causes = first(*map(single_rows, parts))
     if causes:

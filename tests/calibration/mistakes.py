@@ -16,9 +16,11 @@ COUNT = 40
 SEEDS = range(2, 12)
 
 
-def simulated_arm(name: str, seed: int = 1, count: int = COUNT, markers: int = 1) -> ro.CalibrationProblem:
+def simulated_arm(
+    name: str | ro.robot.Robot, seed: int = 1, count: int = COUNT, markers: int = 1
+) -> ro.CalibrationProblem:
     """Return measurements of a ready robot with deviations of 0.5 mm and 0.5 mrad, far from the instrument."""
-    robot = read_robot(READY / f"{name}.toml")
+    robot = read_robot(READY / f"{name}.toml") if isinstance(name, str) else name
     rng = np.random.default_rng(seed)
     low, high = np.clip(robot.limits, -2.5, 2.5).T
     q = rng.uniform(low, high, (count, robot.dof))

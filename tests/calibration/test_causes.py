@@ -28,6 +28,7 @@ from tests.calibration.mistakes import (
     COUNT,
     IN_TABLES,
     MISTAKES,
+    NOISE,
     OTHER,
     ROBOTS,
     SEEDS,
@@ -406,6 +407,52 @@ def test_what_a_learned_noise_or_gears_would_take_up_is_named(wrong, said: str) 
     """Each was calibrated into a robot that is 1.5 to 25 times worse than from clean data, and delivered."""
     result = ro.calibrate(wrong(simulated_arm("ur5e", count=80)))
     assert any(re.search(said, text) for text in result.verdict.reasons), result.causes
+
+
+def test_excluded_rows_of_the_nominal_robot_or_of_another_one_of_its_type_are_named() -> None:
+    """They were outliers without a cause; gross errors still are."""
+    problem = simulated_arm("irb120", count=60)
+    free, rng, y = problem.parameters.free, np.random.default_rng(1), problem.data.blocks[0].y
+    twin = problem.modelled(np.where(free.of_frames, 0.0, free.scale * rng.normal(size=len(free))))[0]
+
+    def calibrated_with(other: np.ndarray, rows: np.ndarray) -> ro.calibration.Calibration:
+        of_rows = np.isin(np.arange(len(y)), rows)[:, None]
+        result = ro.calibrate(values(lambda y: np.where(of_rows, other, y))(problem))
+        assert result.excluded is not None
+        return result
+
+    (said,) = calibrated_with(problem.modelled(np.zeros(len(free)))[0], 4 * np.arange(12)).causes
+    assert "rows P1, P5, P9, P13, P17, P21, P25, P29 and 4 more agree with the nominal robot to 0.001 mm: were" in said
+    (said,) = calibrated_with(twin + NOISE * rng.normal(size=y.shape), np.arange(46, 60)).causes
+    assert "measured at another robot of this type" in said
+    gross = calibrated_with(y + 5e-3 * rng.normal(size=y.shape), 4 * np.arange(12))
+    assert not any("nominal robot" in text for text in gross.causes), gross.causes
+
+
+def test_a_rail_that_is_not_straight_is_named_by_its_axis() -> None:
+    """It was a loose base, in every second row another one."""
+    arm = read_robot(READY / "ur5e.toml")
+    link = np.array([[-np.pi / 2, 0.0, np.pi / 2, 0.0, 0.0], [np.pi / 2, 0.0, 0.0, 0.1, 0.0]])
+    mdh = np.vstack([link[:1], link[1:] + arm.mdh[:1], arm.mdh[1:]])
+    kinds, limits = ("prismatic", *arm.joint_types), np.vstack([[0.0, 2.5], arm.limits])
+    problem = simulated_arm(ro.robot.Robot("on a rail", mdh, joint_types=kinds, limits=limits), count=60)
+    names, nominal = problem.parameters.names, problem.parameters.nominal
+    side = numeric_frame(nominal[[names.index(f"base_{c}") for c in FRAME]])[:3, 2]
+    bowed = values(lambda y: y + 9e-4 * np.sin(np.pi * problem.data.q[:, :1] / 2.5) * side)
+    result = ro.calibrate(bowed(problem))
+    said = re.search(r"the axis of joint 1 is not straight, by (0\.\d+) mm sideways", " ".join(result.causes))
+    assert said, result.causes
+    assert float(said[1]) == pytest.approx(0.9, rel=0.15)
+    assert ro.calibrate(problem).verdict.delivered
+
+
+def test_readings_that_scatter_are_named_before_what_they_make_uncertain(monkeypatch, capsys, tmp_path) -> None:
+    shaken = values(lambda y: y + 5e-4 * np.random.default_rng(4).normal(size=y.shape))(simulated_arm("ur3"))
+    made(monkeypatch, tmp_path, shaken, robot="ur3")
+    capsys.readouterr()
+    assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 4
+    said = r"Inconclusive: the readings scatter by 0.\d+ mm RMS, \d[\d.]* times the stated noise .* the median U over"
+    assert re.search(said, capsys.readouterr().out.replace("\n", " "))
 
 
 def test_gears_that_err_once_and_twice_a_turn_are_no_mistake() -> None:

@@ -226,8 +226,7 @@ def other_places(problem: CalibrationProblem) -> Iterator[str]:
         return
     parts, rest, exact = _stations(points)
     if exact:
-        which = named_rows(problem.data, points.row[parts[-1][0]], "agrees", "agree")
-        yield f"{which} with the nominal robot: {COMPUTED}"
+        yield from computed_rows(problem.on(problem.data.take(points.row[parts[-1][0]])))
         return
     if len(parts) < 2 or len(rest) > len(points.row) / OUTLYING:
         return
@@ -242,6 +241,18 @@ def other_places(problem: CalibrationProblem) -> Iterator[str]:
         other, joint = _other_place(points, first, fit, len(problem.data.sessions) > 1)
         if in_turn or joint != 1:  # no base moves to and fro about the first axis
             yield f"{where} another {other}."
+
+
+def computed_rows(problem: CalibrationProblem) -> Iterator[str]:
+    """Report rows, of those that fit no others, that agree with the nominal robot more exactly than is measured."""
+    points = points_of(problem) or lengths_of(problem)
+    if points is None or points.by_camera or len(points.row) < FEWEST:
+        return
+    own, fit = agreeing(points)
+    exact = rms(fit.error[own])
+    if own.sum() >= FEWEST * (1 + points.lengths) and exact < EXACT:
+        which = named_rows(problem.data, points.row[own], "agrees", "agree")
+        yield f"{which} with the nominal robot to {three_digits(1e3 * max(exact, 1e-6))} mm: {COMPUTED}"
 
 
 def _stations(points: Points) -> tuple[list[tuple[np.ndarray, Fit]], np.ndarray, bool]:

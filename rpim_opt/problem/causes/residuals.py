@@ -33,7 +33,9 @@ from rpim_opt.problem.causes.rows import (
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import SHIFTED, CalibrationProblem
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
+from rpim_opt.problem.registration.frames import ridge_deviations
+from rpim_opt.problem.registration.points import fit_points, points_of
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import Robot, numbered
 from rpim_opt.robot.parameters import of_session, tool_prefix
 
@@ -51,6 +53,7 @@ TWO_KINDS, STARTS = 0.4, 30
 """Rows are of two kinds if two calibrations leave less than this part of the residuals of one; starts of the search."""
 SCATTERED = 5.0  # residuals of rows over those of the others from which on they are of another kind
 JUMPING = 0.5  # mean square step of every joint over that of rows in random order, above which rows have no order
+BENDS = 4  # degree of the polynomial that the side of a rail is
 COURSES = 6  # half waves that a slow motion has over all rows at most
 PLACES, PRECISE, SPANS = 40, 120, 12
 """Rows and joint values from which on something may have moved, and those between which it did and moved back."""
@@ -235,6 +238,7 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
     cause = "is it loose in its nest, or its holder compliant"
     yield from _changes(whole, there, A, [tool_prefix(m) + c for m in markers for c in "xyz"], "reflector", cause, down)
     yield from _tilts(whole, A, flange[:, :3, 3])
+    yield from _rails(whole, A)
     for family in (bends, eccentric, bends | eccentric):  # either alone explains more with fewer columns
         lacking = np.isin(free.names, every[family & ~p.identified])
         if lacking.any():
@@ -276,6 +280,31 @@ def _tilts(problem: CalibrationProblem, A: Array, flange: Array) -> Iterator[Add
     for share in (side, reach, np.column_stack([np.cos(q1), np.sin(q1)])):
         columns = tilts[:, :, None] * share[problem.owners, None]
         yield Addition(columns.reshape(len(A), -1), lambda c: (what, remedy))
+
+
+def _rails(problem: CalibrationProblem, A: Array) -> Iterator[Addition]:
+    """Yield that a linear axis in front of all that turn is not straight: it moves sideways by a polynomial."""
+    p, robot = problem.parameters, problem.robot
+    origin = [p.free.names.index(name) for name in ("base_x", "base_y", "base_z") if name in p.free.names]
+    if len(origin) < 3:
+        return
+    turn = numeric_frame(p.nominal[[p.names.index(f"base_{c}") for c in FRAME]])[:3, :3]
+    for i in range(next((k for k, kind in enumerate(robot.joint_types) if kind == "revolute"), 0)):
+        turn = turn @ numeric_link(*robot.mdh[i])[:3, :3]
+        q = problem.joint_values[:, i]
+        if len(np.unique(q)) < FEWEST:
+            continue
+        place = 2 * (q - q.min()) / np.ptp(q) - 1
+        course = np.polynomial.legendre.legvander(place, BENDS)[problem.owners, 2:]  # straight lines are in the robot
+        sideways = A[:, origin] / p.free.scale[origin] @ turn[:, :2]
+
+        def said(c: Array, of: str = numbered(i, robot.joint_names)) -> tuple[str, str]:
+            bend = np.polynomial.legendre.legval(np.linspace(-1, 1, PLACES), [[0, 0], [0, 0], *c.reshape(2, -1).T])
+            far = three_digits(1e3 * float(np.linalg.norm(np.ptp(bend, axis=1))))
+            what = f"the axis of joint {of} is not straight, by {far} mm sideways along its measured range"
+            return what, "align its rail, or calibrate in the part of it that is used"
+
+        yield Addition((sideways[:, :, None] * course[:, None]).reshape(len(A), -1), said)
 
 
 def _with_others(problem: CalibrationProblem, x: Array, others: np.ndarray) -> tuple[CalibrationProblem, Array]:
@@ -386,6 +415,25 @@ def _two_kinds(problem: CalibrationProblem, x: Array) -> tuple[np.ndarray, float
     left = float(np.sqrt(best / spare / (errors(kept[owners])[kept].sum() / (kept[owners].sum() - rank))))
     rows = np.flatnonzero(second == (second.sum() <= N / 2))
     return rows, left if len(rows) >= FEWEST else np.inf
+
+
+def another_robot(problem: CalibrationProblem, identified: Robot) -> Iterator[str]:
+    """Report rows that by themselves are of a robot of the type, but of the identified one in no base."""
+    points = points_of(replace(problem, robots=identified))
+    if points is None or points.by_camera or len(points.row) < FEWEST:
+        return
+    x, free = ridge_deviations(problem), problem.parameters.free
+    model, z = problem.with_repeatability(None).linearize(x), x / free.scale
+    spare = len(model.b) - _freedom(model)
+    placed, own = rms(fit_points(points).error), rms(problem.errors(x))
+    fits = spare > FEWEST and np.linalg.norm(model.b - model.A @ z) < NOTICED * np.sqrt(spare)
+    if fits and rms(z[~free.of_frames]) < NOISY and placed > NOISY * own:
+        yield (
+            f"{named_rows(problem.data, points.row, 'fits', 'fit')} the nominal robot with deviations of their own "
+            f"({three_digits(1e3 * own)} mm RMS), the robot of the others in no base and with no reflector "
+            f"({three_digits(1e3 * placed)} mm): were they measured at another robot of this type, or did several "
+            "joints change? Calibrate the two groups separately, or leave one out ([exclude])."
+        )
 
 
 def _uneven_noise(problem: CalibrationProblem, x: Array) -> Iterator[str]:
