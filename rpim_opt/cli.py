@@ -602,6 +602,7 @@ def compensate(
             payload=read.payload if mass is None else mass, payload_centre=centre, despite_verdict=despite_verdict,
             limit=limit and 1e-3 * limit,
         )  # fmt: skip
+        compensation = replace(compensation, texts=understood.texts)
     code = int(bool(compensation.missed))
     return _with_table(compensation, compensation.csv(), out, compensation.content(), code=code, read=understood)
 

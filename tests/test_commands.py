@@ -548,6 +548,17 @@ def test_new_says_that_the_nominal_robot_does_not_explain_the_data_before_what_i
     assert re.search(r"\(the nominal robot does not explain the data, RMS error \d+ mm; optimum of the regist", guessed)
 
 
+def test_new_says_that_a_robot_file_was_exported_from_a_calibration(made: Path, cell: Path, tmp_path: Path) -> None:
+    """Its undetermined parameters would be taken for as well known as the others."""
+    ro.use.export_files(ro.load_result(made / "results"), tmp_path / "arm.urdf", urdf=cell / "arm.urdf")
+    q = np.random.default_rng(2).uniform(-2, 2, (20, 6))
+    write_csv(tmp_path / "a.csv", HEADER, np.hstack([urdf_points(tmp_path / "arm.urdf", q), q]))
+    options = TableOptions(units=parse_units("rad,m"))
+    notes = ro.store.new_problem(tmp_path / "again", tmp_path / "arm.urdf", tmp_path / "a.csv", options=options).notes
+    (note,) = [note for note in notes if note.startswith("arm.urdf was exported from a calibration (")]
+    assert "rpim-opt update RESULTS TABLE" in note
+
+
 @pytest.mark.slow
 def test_joint_values_that_are_ignored_are_a_likely_cause(monkeypatch, capsys, cell, tmp_path) -> None:
     monkeypatch.chdir(tmp_path)
@@ -724,6 +735,13 @@ def test_a_saved_result_compensates_as_the_live_one(monkeypatch, capsys, cell, m
     (tmp_path / "go.csv").write_text("x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg\n600,100,400,0,90,0\n")
     run(monkeypatch, *arguments)
     assert "Orientation of targets: rx_deg: roll (extrinsic xyz), ry_deg: pitch" in capsys.readouterr().out
+    (tmp_path / "go.csv").write_text("label,x_mm,y_mm,z_mm,Ziel,speed,status\nP1,600,100,400,=SUM(door),5,new\n")
+    assert run(monkeypatch, *arguments, "--out", str(out)) == 0
+    with out.open() as stream:  # texts are carried through, but for columns that are the result's
+        (row,) = csv.DictReader(stream)
+    assert row["Ziel"] == "'=SUM(door)"
+    assert row["status"] in ("ok", "extrapolated")
+    assert "speed" not in row
     (tmp_path / "go.csv").write_text("label,x_mm,y_mm,z_mm\nP1,9000,0,100\n")
     assert run(monkeypatch, *arguments) == 1  # unreachable, with or without a limit
     assert "1 of 1 commands miss their target" in capsys.readouterr().out

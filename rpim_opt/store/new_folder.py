@@ -50,6 +50,7 @@ SHARED = (
     'one instrument measured several chains from one link; by chain as { left = ["base_*"], ... }.'
 )
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
+EXPORTED = re.compile(rb"calibrated (\d{4}-\d\d-\d\d, digest \w+)")  # in the notes of an exported file
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
 UNLIKE = 5.0  # ratio of the spreads of measured points and of the nominal flange from which on units are likely wrong
 UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above which they are the same mounting.
@@ -184,6 +185,12 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Interpretation, rows:
             "noise beyond it is taken for the robot's repeatability."
         )
     yield from (f"{source.name}, {note}" for note in arm.notes)
+    if exported := EXPORTED.search(files.read_bytes(source)):
+        yield (
+            f"{source.name} was exported from a calibration ({exported[1].decode()}): deviations from it count as new, "
+            "and what that one left undetermined is not stated. To add measurements to it: rpim-opt update RESULTS "
+            "TABLE; to begin anew take the robot's original file."
+        )
     there = "the flange's origin"
     if placed(arm.tool) != placed(np.zeros(6)):  # of a URDF, or a DH table in another convention than the modified one
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"

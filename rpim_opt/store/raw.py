@@ -13,7 +13,7 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.layout import RawTable, TableOptions
-from rpim_opt.basics.tables import EXCEL, Columns, Grid, read_columns
+from rpim_opt.basics.tables import EXCEL, Columns, Grid, is_numeral, read_columns
 from rpim_opt.basics.units import split
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.distance import cable, distance
@@ -63,6 +63,12 @@ class Interpretation:
         """The names of ignored columns of all files."""
         unused = (each.column for table in self.tables for each in table.meant if each.meaning == "not used")
         return tuple(dict.fromkeys(unused))
+
+    @property
+    def texts(self) -> dict[str, list[str]]:
+        """The ignored columns that hold more than numbers, as the files have them."""
+        cells = {name: [str(cell) for cell in self.raw.get(name.lower(), ())] for name in self.left_out}
+        return {name: own for name, own in cells.items() if not all(map(is_numeral, filter(None, own)))}
 
     @property
     def count(self) -> int:

@@ -74,10 +74,10 @@ class Compensation:
     error and its expanded uncertainty (k = 2) together exceed ``limit`` [m]. An ``"ok"`` row is ``"extrapolated"``
     beyond the measured joint ranges; ``outside`` are all rows there. ``note`` says why a robot is not delivered, how
     joints count whose signs or zeros were estimated, and of which session the instrument's frame is; ``point`` which
-    point is moved, and why orientations are not corrected; ``source`` names the calibration. ``beside`` (N,) [m] is how
-    far a stated position is from that of the nominal robot at the joint values stated beside it, NaN where there are
-    none. ``std_after_motion`` is the RMS [m] of the standard uncertainties that one motion of all targets leaves, NaN
-    for fewer than `MOVED` of them.
+    point is moved, and why orientations are not corrected; ``source`` names the calibration; ``texts`` are columns of
+    the targets' table that are carried through. ``beside`` (N,) [m] is how far a stated position is from that of the
+    nominal robot at the joint values stated beside it, NaN where there are none. ``std_after_motion`` is the RMS [m] of
+    the standard uncertainties that one motion of all targets leaves, NaN for fewer than `MOVED` of them.
     """
 
     robot: Robot
@@ -98,6 +98,7 @@ class Compensation:
     limit: float = np.inf
     source: str = ""
     std_after_motion: float = np.nan
+    texts: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     def __str__(self) -> str:
         figures = []
@@ -190,7 +191,8 @@ class Compensation:
         left = {"position_error_mm": self.position_error, "orientation_error_mrad": self.orientation_error}
         left |= {"std_mm": self.std, "orientation_std_mrad": self.orientation_std}
         figures = commands | {name: 1e3 * values for name, values in left.items()}
-        return {"label": self.label, **{k: v.tolist() for k, v in figures.items()}, "status": self.status}
+        own = {"label": self.label, **{k: v.tolist() for k, v in figures.items()}, "status": self.status}
+        return {**own, **{name: cells for name, cells in self.texts.items() if name not in own}}
 
     def content(self) -> dict[str, Any]:
         """Return the errors [mm, mrad], and a row for every target as in `csv`."""

@@ -31,7 +31,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier, Fit, HeldOut, Record
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.causes.positions import other_places, other_rows
-from rpim_opt.problem.causes.residuals import shown_by_residuals
+from rpim_opt.problem.causes.residuals import NOTICED, shown_by_residuals
 from rpim_opt.problem.causes.rows import FEWEST, first
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.multi_robot import identifying_sessions
@@ -407,21 +407,22 @@ def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple
     """Return the sentences of `displacement`, or the change of the robot that leaves clearly less of chi-squared.
 
     That is less by `AS_GOOD`, of new measurements and prior together, than after registration and with another base.
-    What changed between them comes first.
+    What changed between them comes first, unless one change before all leaves no more than the noise.
     """
-    if between := _between_rows(result, data):
-        return between, ""
+    between = _between_rows(result, data)
     moved = displacement(result, data, held)
     place = registration(result.problem.parameters.free, data)
     placed_by = {place + axis for axis in FRAME} <= set(result.problem.parameters.free.names)
     likely = moved[0] and f"Likely: the instrument or the base moved. {moved[0]}", moved[1]
-    if not any(moved) or not placed_by or result.known_covariance is None or not result.problem.keeps_rows:
-        return likely
+    if not any((between, *moved)) or not placed_by or result.known_covariance is None or not result.problem.keeps_rows:
+        return (between, "") if between else likely
     causes, fit = _changes(result, data)
     again, registered_fit = _changes(result, registered(result, data)[0])
     best, *others = [cause for cause in causes if cause.kind != "reading"]
     base = next(cause for cause in again if cause.members[0].startswith(place))
     left, motion = fit.squares - best.gain, registered_fit.squares - base.gain
+    if between and left > NOTICED**2 * (fit.equations - len(best.members)):
+        return between, ""
     if motion - left <= AS_GOOD:
         return likely if left - motion > AS_GOOD else moved
     names = [best.name, *(cause.name for cause in others if cause.gain > best.gain - AS_GOOD)]

@@ -251,7 +251,7 @@ def test_after_an_update_files_hold_the_geometry_alone(rippled, tmp_path):
     assert "_rad" not in text
 
 
-def test_a_worn_gear_is_one_change_with_its_sizes(rippled):
+def test_a_worn_gear_is_one_change(rippled):
     """A curve is hundreds of coefficients without individual meaning: each was a change of its own."""
     result = rippled[0]
     worn = measured(3 * SIZE)[1].take(np.arange(60))

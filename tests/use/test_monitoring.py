@@ -17,6 +17,7 @@ from rpim_opt.basics import InputError
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.use.monitoring import cusum, cusum_limit
+from tests.calibration.mistakes import simulated_arm
 from tests.simulate import simulated
 from tests.test_cli import run
 
@@ -126,6 +127,21 @@ def test_a_joint_that_slipped_is_no_moved_base() -> None:
     accepted = ro.calibration.accept(result, ro.data.Requirement(limit=2e-4), data)  # which does not compare them
     assert "Likely" not in str(accepted)
     assert "If neither moved, the robot changed, and --register would hide that." in str(accepted)
+
+
+@pytest.mark.parametrize("name", ["theta3", "theta5"])
+def test_a_zero_that_changed_before_the_checks_is_no_backlash_of_another_joint(name: str) -> None:
+    """Registered again, checks from two sides look like another joint's backlash, or like a loose reflector."""
+    problem = simulated_arm("ur5e", count=100)
+    result = ro.calibrate(problem.on(problem.data.take(np.arange(60))))
+    checks = problem.on(problem.data.take(np.arange(60, 100)))
+    changed = np.where(np.array(problem.parameters.free.names) == name, 2e-3, 0.0)
+    by_change = checks.modelled(changed)[0] - checks.modelled(np.zeros(len(changed)))[0]
+    (block,) = checks.data.blocks
+    found = ro.use.monitor(result, replace(checks.data, blocks=(replace(block, y=block.y + by_change),)))
+    assert found.drift is not None
+    assert found.drift.cause.name == name
+    assert found.mistake.startswith(f"Likely: {name} changed: that leaves chi-squared")
 
 
 def test_update_and_monitor_say_one_size_of_a_change() -> None:
