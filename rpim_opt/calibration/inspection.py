@@ -139,8 +139,7 @@ class Inspection(Tabled):
             "nominal": statistics(self.residual),
             "repeated": self.repeated,
             "observability": {
-                "parameters": o.names, "rank": o.rank, "weak": o.weak,
-                "condition": o.condition, "raw_condition": o.raw_condition, **o.indices,
+                "parameters": o.names, "rank": o.rank, "weak": o.weak, "condition": o.condition, **o.indices,
                 "unidentifiable": o.unidentifiable, "redundant": o.redundant,
             },
             "contact": self.contact,

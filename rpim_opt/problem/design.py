@@ -16,7 +16,6 @@ from rpim_opt.basics.units import UNITS, joint_columns, with_unit
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.pose import position
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
 
@@ -236,9 +235,7 @@ class Observability(Brief):
     on. ``redundant`` are combinations, name to coefficient [mm, mrad], along which the parameters may change without
     changing any measurement; the largest coefficient is 1. ``base`` are the base parameters, what the data determine,
     each a sum, name to coefficient [mm, mrad]: the first name has coefficient 1, and the redundant parameters add to it
-    (QR with column pivoting). ``condition`` is the largest over the smallest singular value that is not zero,
-    ``raw_condition`` |U| |U^-1| of the Jacobian in millimetres and radians, neither whitened nor scaled (paper, Eq.
-    24); infinite where it is singular.
+    (QR with column pivoting). ``condition`` is the largest over the smallest singular value that is not zero.
 
     >>> import rpim_opt as ro
     >>> found = ro.problem.observe(ro.load("rank_deficient").problem)
@@ -254,7 +251,6 @@ class Observability(Brief):
     redundant: tuple[dict[str, float], ...]
     base: tuple[dict[str, float], ...]
     condition: float
-    raw_condition: float
 
     @property
     def weak(self) -> int:
@@ -267,10 +263,9 @@ class Observability(Brief):
     def __str__(self) -> str:
         indices = ", ".join(f"{name} {value:.3g}" for name, value in self.indices.items())
         weak = f", {self.weak} of them more precisely from the prior than from the data" if self.weak else ""
-        raw = f", {self.raw_condition:.3g} in mm and rad" if np.isfinite(self.raw_condition) else ""
         lines = [
             f"{self.rank} of {len(self.names)} parameter combinations are identifiable{weak}.",
-            f"Condition number {self.condition:.3g} in prior scales and noise{raw}; observability {indices}.",
+            f"Condition number {self.condition:.3g} in prior scales and noise; observability {indices}.",
         ]
         if self.unidentifiable:
             lines.append(f"Unidentifiable: {', '.join(self.unidentifiable)}.")
@@ -310,14 +305,6 @@ def observe(problem: Source) -> Observability:
     A, rank = model.qr_factor[: len(x), : len(x)], model.rank
     length = np.linalg.norm(A, axis=0)
     blind = length <= 1e-10 * length.max()
-    units = np.where(np.array(free.dimensions) == "length", 1.0, 1e3)  # mm per mm, mm per rad
-    configurations = 0
-    U = np.zeros((0, len(x)))
-    for part in problem.rows():
-        configurations += len(np.unique(part.data.configuration))
-        U = reduced_rows(part.jacobian(x) * units, U)
-    raw = np.linalg.svd(U, compute_uv=False)
-    tiny = 1e-15 * raw[0]  # rounding, another on every processor
     # redundant columns are often parallel and of one length: the first counts as the longest, or rounding would choose
     pivot = scipy.linalg.qr(A * (1 - TIE * np.arange(len(x))), mode="r", pivoting=True)[1][:rank]
     # column rest[j] = sum_i W_ij column pivot[i]
@@ -340,11 +327,11 @@ def observe(problem: Source) -> Observability:
         added = {free.names[k]: float(v) for k, v in zip(rest, sums, strict=True) if v}
         base.append({free.names[pivot[i]]: 1.0} | added)
     return Observability(
-        names=free.names, singular_values=s, rank=rank, configurations=configurations,
+        names=free.names, singular_values=s, rank=rank,
+        configurations=sum(len(np.unique(part.data.configuration)) for part in problem.rows()),
         unidentifiable=tuple(n for n, b in zip(free.names, blind, strict=True) if b),
         redundant=tuple({free.names[k]: float(null[k]) for k in np.flatnonzero(null)} for null in in_order),
         base=tuple(base), condition=float(s[0] / s[rank - 1]),
-        raw_condition=float(raw[0] / raw[-1]) if model.equations >= len(x) and raw[-1] > tiny else float("inf"),
     )  # fmt: skip
 
 

@@ -77,7 +77,6 @@ def test_the_papers_condition_number_is_that_of_a_singular_matrix() -> None:
     o = observe(ro.load("paper_arm").problem)
     # the paper prints 1.157e21 (Eq. 24): rounding, of a matrix with 20 independent columns of 26
     assert o.rank == 20
-    assert o.raw_condition > 1e15
     assert o.condition < 1e4
 
 
