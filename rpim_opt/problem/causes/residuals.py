@@ -298,9 +298,8 @@ def _rails(problem: CalibrationProblem, A: Array) -> Iterator[Addition]:
         course = np.polynomial.legendre.legvander(place, BENDS)[problem.owners, 2:]  # straight lines are in the robot
         sideways = A[:, origin] / p.free.scale[origin] @ turn[:, :2]
 
-        def said(c: Array, of: str = numbered(i, robot.joint_names)) -> tuple[str, str]:
-            bend = np.polynomial.legendre.legval(np.linspace(-1, 1, PLACES), [[0, 0], [0, 0], *c.reshape(2, -1).T])
-            far = three_digits(1e3 * float(np.linalg.norm(np.ptp(bend, axis=1))))
+        def said(c: Array, of: str = numbered(i, robot.joint_names), course: Array = course) -> tuple[str, str]:
+            far = three_digits(1e3 * float(np.linalg.norm(np.ptp(course @ c.reshape(2, -1).T, axis=0))))
             what = f"the axis of joint {of} is not straight, by {far} mm sideways along its measured range"
             return what, "align its rail, or calibrate in the part of it that is used"
 
