@@ -120,9 +120,7 @@ class Learned(Brief):
     @property
     def extensions(self) -> tuple[str, ...]:
         """The extensions of the selected model."""
-        if not self.trials:
-            return ()
-        return self.trials[0].extensions
+        return next((trial.extensions for trial in self.trials), ())
 
     def gain(self, extension: str) -> float | None:
         """Return the decrease of -2 ln L when an extension is added to the best model without it."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.units import UNITS, accepted_units
 from rpim_opt.bayes.prior_terms import Result, default_widths, marginal
 from rpim_opt.convex.constraints import FAR
@@ -127,9 +127,5 @@ def _stated_widths(result: Result) -> Array:
 
 def _places(names: Sequence[str], some: Sequence[str]) -> np.ndarray:
     """Return where some parameters stand in a table."""
-    for name in some:
-        if name not in names:
-            raise InputError(
-                "Prior.from_population", f"parameter '{name}', which some of them lack", "robots of one type"
-            )
-    return np.array([names.index(name) for name in some])
+    known = {name: i for i, name in enumerate(names)}
+    return np.array([pick(known, name, "Prior.from_population", also="robots of one type, all with ") for name in some])

@@ -117,8 +117,8 @@ class Monitoring:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
             lines.append(f"Outside the prediction interval of a new reading: {listed(named, between='; ')}.")
         if self.alarm is not None and self.since is not None:
-            at = self._named(self.alarm)
-            lines.append(f"Cumulative sum above its limit at check {at}, rising since {self._named(self.since)}.")
+            at, since = map(self._named, (self.alarm, self.since))
+            lines.append(f"Cumulative sum above its limit at check {at}, rising since {since}.")
         if self.drift is not None:
             cause, first = self.drift.cause, self.drift.first
             course = {0: "before the first check"}.get(first, f"in one step before {self._named(first)}")

@@ -15,6 +15,7 @@ from rpim_opt.basics.arrays import Array, rms, statistics
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import counted, joined, table, three_digits
 from rpim_opt.basics.units import display, printed
+from rpim_opt.bayes.model_selection import deviations, named
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration.held_out import displacement, registered, registration
@@ -508,8 +509,7 @@ def with_data(result: Calibration, data: Dataset) -> CalibrationProblem:
 
 def previous_deviations(result: Calibration, problem: Source) -> Array:
     """Return the result's deviations (n,) [SI] of a problem's parameters, zero where it does not know them."""
-    known = dict(zip(result.problem.parameters.free.names, result.x.tolist(), strict=True))
-    return np.array([known.get(name, 0.0) for name in problem.parameters.free.names])
+    return deviations(problem, named(result.problem, result.x))
 
 
 def posterior_as_prior(
