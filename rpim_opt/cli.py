@@ -122,7 +122,9 @@ ROBOTS = _completed(lambda: ro.robots())
 MODELS = _completed(lambda: ("auto", "geometry"))
 COMPONENTS = _completed(lambda: ("robot", "free", "level", "declared"))
 Problem = Annotated[str, Argument(help="A problem folder, or the name of a shipped one.", autocompletion=SHIPPED)]
-RULES = "learned (estimated prior scales), or one weight by a rule (reml, l_curve, gcv, k_fold, ...) or a number."
+RULES = (
+    "learned (estimated prior scales), or one weight by a selection rule (reml, l_curve, gcv, k_fold, ...) or a number."
+)
 READY = "least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso."
 PARTS = "Noise to estimate: robot (repeatability), level (factor on the stated noise), free (both), declared (none)."
 Variant = Annotated[Text, Option(help="A [variant.NAME] of the problem file.")]
@@ -132,14 +134,16 @@ Kind = Annotated[Text, Option(help="Measurement type: position, pose, cable, ...
 Several = "several files are stacked, or joined as by rpim-opt new."
 NEAREST = "Join files by nearest time, with this largest difference [s]."
 ROTATION = "Meaning of rx, ry, rz: 'extrinsic xyz' (default), 'intrinsic zyx', vector."
-Tolerance = Annotated[Number, Option(help="Acceptance tolerance [mm]: exit code 1 if rejected, 4 if inconclusive.")]
+Tolerance = Annotated[Number, Option(help="Acceptance limit [mm]: exit code 1 if rejected, 4 if inconclusive.")]
 Register = Annotated[bool, Option("--register", help="The instrument was moved: register it again before judging.")]
 Box = Annotated[Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's base; default: measured joint ranges.")]
 Measured = Annotated[Choice, Option("--measured/--region", help="Judge measured configurations, or all of the region.")]
 Marker = Annotated[Text, Option(help="Name of the reflector, if there are several.")]
 UrdfBase = Annotated[Text, Option(help="Base link of the chain; default: the root of the URDF.")]
 UrdfTip = Annotated[Text, Option(help="Tip link of the chain, if there are several.")]
-Chain = Annotated[str, Option(help="Chain name: makes a problem with a URDF's joint origins, or adds a chain to one.")]
+Chain = Annotated[
+    str, Option(help="Name of the chain: identify the URDF's joint origins, or add a chain to a problem that does.")
+]
 Source = Annotated[Text, Option(help="Who measured what, when, with which instrument; default: names of the files.")]
 UrKinematics = Annotated[File, Option(help="kinematics.yaml of ROS for a Universal Robot; corrected file to --out.")]
 CONF = "calibration.conf copied from a Universal Robot's controller; corrected file to --out."
@@ -147,7 +151,7 @@ Convention = Annotated[str, Option(help="Convention of --mdh: modified (Craig), 
 TIP = "The reflector is the tip link: write its identified pose."
 PERMITTED = "Largest permitted error [mm]: exit code 1 if exceeded; default: the result's limit."
 REMAINING = "Largest residual error plus its U (k = 2) [mm]: exit code 1 above; default: the result's limit."
-ORIENTATION = "Correct all orientations, or ignore them; default: all if known better than nominally, position first."
+ORIENTATION = "Correct the orientation of all targets, or of none; default: of all if its U is below the nominal error."
 Workers = Annotated[int, Option(help="Number of parallel processes.")]
 Resume = Annotated[Choice, Option(help="Resume an interrupted run, or discard it and start again.")]
 Table = Annotated[File, Option(help="CSV file for the rows.")]
@@ -320,7 +324,9 @@ def calibrate(
     ] = None,
     formulation: Annotated[Text, Option(help=READY, autocompletion=FORMULATIONS)] = None,
     noise: Annotated[Text, Option(help=PARTS, autocompletion=COMPONENTS)] = None,
-    drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
+    drop_outliers: Annotated[
+        bool, Option("--drop-outliers", help="Calibrate again without the rows that are flagged as outliers.")
+    ] = False,
     use_validation: Annotated[Choice, Option(help="Refit with validation rows; default: after new --hold-out.")] = None,
     limit: Tolerance = None,
     box: Box = None,
@@ -624,7 +630,9 @@ def design(
     problem: Problem,
     count: Annotated[int, Option(help="How many configurations to choose.")] = 30,
     criterion: Annotated[str, Option(help="Criterion: V (variance of positions), D (determinant), A (trace).")] = "V",
-    candidates: Annotated[int, Option(min=1, max=1_000_000, help="Random candidates within joint limits.")] = 1000,
+    candidates: Annotated[
+        int, Option(min=1, max=1_000_000, help="Number of random candidates within joint limits.")
+    ] = 1000,
     table: Annotated[File, Option(help="Table of candidates to use instead: q1_deg, ...")] = None,
     point: Annotated[Text, Option(help="For touches: the point x,y,z [mm] in the robot's base frame.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the random candidates.")] = 0,
@@ -696,7 +704,7 @@ def compare(
     selector: Annotated[str, Option(help="learned,reml,l_curve,1.0,...: rules and weights.")] = "learned",
     methods: Annotated[str, Option(help="Baselines: nominal,levenberg_marquardt,...")] = "",
     splits: Annotated[str, Option(help="Held-out data: folder, a fraction (0.25), or a number of folds.")] = "folder",
-    seeds: Annotated[int, Option(min=1, help="Number of random draws.")] = 1,
+    seeds: Annotated[int, Option(min=1, help="Number of random draws of held-out rows.")] = 1,
     workers: Workers = 1,
     resume: Resume = None,
     out: Annotated[File, Option(help="Folder for the summary, the replicates and the figure.")] = None,

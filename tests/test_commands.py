@@ -706,9 +706,9 @@ def test_another_payload_needs_masses_of_the_links(monkeypatch, capsys, tmp_path
     arguments = ["compensate", str(tmp_path), str(tmp_path / "go.csv"), "--position-only"]
     assert run(monkeypatch, *arguments, "--out", str(tmp_path / "out.csv")) == 0
     assert run(monkeypatch, *arguments, "--out", str(tmp_path / "no.csv"), "--payload", "2.5") == 2
-    assert "2.5 kg, where 0 kg were measured and masses of the links are guessed" in capsys.readouterr().err
+    assert "2.5 kg; measured with 0 kg, and the masses of the links are assumed" in capsys.readouterr().err
     assert not (tmp_path / "no.csv").exists()
-    with pytest.raises(ro.InputError, match="masses of the links are guessed"):
+    with pytest.raises(ro.InputError, match="masses of the links are assumed"):
         result.predict(problem.data.q, payload=2.5)
 
 
@@ -871,7 +871,7 @@ def test_what_no_file_can_hold_is_named(monkeypatch, capsys, tmp_path) -> None:
     ro.store.save_result(ro.calibrate(problem, ro.tikhonov, 1.0), tmp_path / "result.json")
     assert run(monkeypatch, "export", str(tmp_path), "--mdh", str(tmp_path / "arm.csv")) == 0
     assert "Files cannot hold ratio2: their geometry is from a separate fit" in capsys.readouterr().out
-    assert "It includes what geometry alone misses" in (tmp_path / "arm.csv").read_text()
+    assert "It includes the error of leaving out the model extensions" in (tmp_path / "arm.csv").read_text()
 
 
 def test_one_robot_of_several_is_exported_by_its_name(monkeypatch, capsys, tmp_path) -> None:

@@ -15,7 +15,7 @@ TINY = float(np.finfo(float).tiny)  # divisors are no smaller
 
 
 def finite_numbers(where: str, values: Any, *shapes: tuple[int, ...]) -> Array:
-    """Return values as an array; InputError unless they are finite numbers in one of some shapes."""
+    """Return values as an array; InputError unless they are finite numbers of one of the given shapes."""
     accepted = f"finite numbers of shape {' or '.join(map(str, shapes))}"
     try:
         array = np.asarray(values, dtype=float)

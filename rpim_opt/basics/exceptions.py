@@ -94,7 +94,7 @@ class RowError(InputError):
 
 
 class Conflict(NamedTuple):
-    """Contradictory constraints: how far to loosen bounds of parameters and ``stated`` constraints [SI].
+    """Contradictory constraints, and by how much to loosen bounds of parameters and ``stated`` constraints [SI].
 
     ``constraints`` cannot hold together, and none can be left out; ``loosen`` says by how much, of either kind.
     """

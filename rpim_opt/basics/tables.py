@@ -518,7 +518,7 @@ def records(columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 
 
 def columns_csv(columns: Mapping[str, Sequence[Any]], exact: Collection[str] = ()) -> str:
-    """Return columns as CSV; floats with six digits behind the point, nine in ``exact`` ones; empty if not finite."""
+    """Return columns as CSV; floats with six decimals, nine in ``exact`` ones; empty if not finite."""
 
     def cell(name: str, value: Any) -> Any:
         if not isinstance(value, float):

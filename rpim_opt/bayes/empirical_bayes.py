@@ -142,8 +142,8 @@ def _contradicted(fit: Fit) -> Iterator[str]:
             amounts.append(f"{amount / factors.max() / si:+.3g} {unit}")
         named = joined([f"'{known[i].text}'" for i in groups[worst]])
         yield (
-            f"The data contradict prior {named}, by {joined(amounts)} (chi-squared {chi2[worst]:.0f} of "
-            f"{len(amounts)}). Correct what is stated, or take it out of the prior."
+            f"The data contradict prior {named}, by {joined(amounts)} (chi-squared {chi2[worst]:.0f}, "
+            f"degrees of freedom {len(amounts)}). Correct the known values, or take them out of the prior."
         )
         left = np.setdiff1d(np.arange(len(known)), groups[worst])
         known, R, d, S = [known[i] for i in left], R[left], d[left], S[np.ix_(left, left)]

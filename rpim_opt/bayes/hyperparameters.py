@@ -61,7 +61,7 @@ class Trial(NamedTuple):
 
 
 class ExcludedRow(NamedTuple):
-    """A row that was excluded as an outlier: its error over the median of all rows' errors, and the error [SI]."""
+    """A row that was excluded as an outlier: the ratio of its error to the median error, and the error [SI]."""
 
     label: str
     ratio: float
@@ -285,7 +285,7 @@ def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:
 def require_finite(*arrays: Array) -> None:
     """Refuse non-finite residuals or derivatives."""
     if not all(np.isfinite(values).all() for values in arrays):
-        accepted = "finite measurements, and a finite model, of CasADi's functions (ca.sin, not math.sin)"
+        accepted = "finite measurements and a finite model; own terms call CasADi's functions (ca.sin, not math.sin)"
         raise InputError("data", "non-finite residuals or derivatives", accepted)
 
 

@@ -56,7 +56,7 @@ def error_vectors(problem: CalibrationProblem, x: Array) -> Array:
 
 
 def largest_errors(problem: Source, x: Array) -> list[tuple[float | None, str]]:
-    """Return the error [SI] of every row at x (n,) [SI], and of which dimension: that of more times the median.
+    """Return the error [SI] of every row at x (n,) [SI] in the dimension where it is more times the median, and that.
 
     None for rows without length and angle; what is known of a distance counts as its length.
     """
@@ -169,7 +169,7 @@ def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.nda
 
 
 def coherent(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndarray:
-    """Return which rows (r,) have errors like their neighbours in joint space, or are a run in time, so no outliers."""
+    """Return which rows (r,) are no outliers: with errors like their neighbours in joint space, or a run in time."""
     q = problem.data.q
     visit = np.cumsum(np.any(np.diff(q, axis=0, prepend=q[:1]) != 0, axis=1))  # of the same joint values
     suspect = np.zeros(visit[-1] + 1, dtype=bool)

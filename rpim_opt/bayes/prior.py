@@ -142,7 +142,7 @@ class Prior:
         return cls(centre=centre, scale=width, optional=tuple(centre))
 
     def where_known(self, stated: Parameters, found: Parameters) -> Parameters:
-        """Return the table that was found, with frames of known values there, and all that is known where it is stated.
+        """Return the table that was found, with known frames and known parameters at their stated values.
 
         Of an orientation, and of frames with a scale of their own that is no wider than that of the table, too.
         """
@@ -157,7 +157,7 @@ class Prior:
         return replace(found, nominal=nominal)
 
     def without_optional(self) -> Prior:
-        """Return the prior without what is optional."""
+        """Return the prior without the terms that may be left out (``optional``)."""
         centre, scale = (
             {key: value for key, value in each.items() if key not in self.optional}
             for each in (self.centre, self.scale)

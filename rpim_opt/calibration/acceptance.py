@@ -280,7 +280,7 @@ class Acceptance:
         return replace(calibration, reasons=calibration.reasons or (self.summary,) * (self.verdict == "rejected"))
 
     def sentences(self) -> list[str]:
-        """Return the verdict, its reasons and its grounds, sentence by sentence."""
+        """Return the verdict with its reasons and the evidence, sentence by sentence."""
         requirement = self.requirement
         limit = f"limit {1e3 * requirement.limit:g} mm with {percent(requirement.confidence)} confidence"
         lines = [
@@ -357,7 +357,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     if result.contradiction:
         lacking.append("Missing: constraints that agree with the data; U depends on them.")
     if ambiguous_deviation(result):
-        check = "Missing: a check of the frame or scale below, whose error U does not contain. If it is right, "
+        check = "Missing: a check of the frame or scale named below; U does not include its error. If it is right, "
         lacking.append(f"{check}write the parameters that deviate into the robot's file as identified.")
     undecided = () if result.mapping is None else result.mapping.ambiguities
     lacking += [reason for reason in result.verdict.reasons if reason in undecided]
@@ -409,13 +409,13 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
         return (
             f"Missing: the base frame, which {joined(list(kinds))} readings do not determine: more of them hardly "
             f"reduce U, at most {1e3 * bound:.3f} mm. Measure from three anchors or more (column `fixture`), or state "
-            "what a survey or the drawing says of the anchor, its length and the first link in [prior] "
+            "what a survey or the data sheet says of the anchor, the cable's length and the first link in [prior] "
             '(known = ["anchor_x = 900 +- 0.05 mm", ...]).'
         )
     measured = reached_positions(result, found.region, _measured(result), found.requirement.confidence)[1].max()
     apart = ""
     if measured < bound / 2:
-        apart = f", at measured configurations {1e3 * measured:.3f} mm (--measured tests these alone, --box a part)"
+        apart = f", at measured configurations {1e3 * measured:.3f} mm (--measured tests these alone, --box a box)"
     return (
         f"Missing: more measurements. U is at most {1e3 * bound:.3f} mm{apart}; with all parameters known the robot's "
         f"repeatability would still contribute {1e3 * repeatability:.3f} mm. `rpim-opt design --augment` names the "

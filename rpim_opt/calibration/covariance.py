@@ -166,7 +166,7 @@ class NoiseTest(NamedTuple):
 
     @property
     def overstated(self) -> bool:
-        """Whether residuals are so small that the noise must be stated too large."""
+        """Whether residuals are so small that the stated noise must be too large."""
         return self.probability < UNLIKELY and self.ratio < 1
 
 

@@ -31,7 +31,7 @@ class Flag(NamedTuple):
 
 
 class ActiveBound(NamedTuple):
-    """An active bound of a parameter [SI], its multiplier, and the gain of loosening it by a tenth."""
+    """An active bound of a parameter [SI], its multiplier, and the decrease of the objective if loosened by a tenth."""
 
     name: str
     bound: float

@@ -161,8 +161,8 @@ class LackOfFit:
         if self.repeated is not None:
             beyond = ": residuals are no larger."
             if self.excess:
-                beyond = f"; {_size(self, self.excess)} of the residuals is systematic (repeatable), unless the "
-                beyond += "robot stood still between them."
+                beyond = f"; {_size(self, self.excess)} of the residuals is systematic (repeatable), if the "
+                beyond += "robot moved away between the readings."
             lines.append(f"Repeated readings of a configuration agree to {_size(self, self.repeated)} RMS{beyond}")
         return lines
 

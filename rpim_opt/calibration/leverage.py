@@ -108,7 +108,7 @@ def influence(result: Outcome) -> Influence:
     moving = np.array([name not in at_bound for name in free.names])
     gradient = A.T @ (A @ result.z - b) + L.T @ (L @ result.z - c)
     if np.linalg.norm(gradient[moving]) > BALANCED * np.linalg.norm(A.T @ b):
-        squares = "a squared loss, or a robust one that is reweighted squares (Huber's)"
+        squares = "a squared loss, or a robust one that is solved by reweighted squares (Huber's)"
         accepted = f"{squares}; and no active constraints other than bounds"
         raise InputError("influence", f"formulation '{formulation.name}'", accepted)
     T = np.zeros((len(free), len(A) + len(L)))  # H^-1 = T T'

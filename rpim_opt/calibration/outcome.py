@@ -144,9 +144,9 @@ class Outcome:
         if not self.no_intervals:
             conditional = "Standard deviations and intervals are conditional on them and too small. "
         return (
-            f"The data contradict constraints ({names}): without them squared residuals and penalty are "
-            f"{three_digits(without)} instead of {three_digits(held)}. {conditional}Check the drawing and the nominal "
-            "robot, or loosen them."
+            f"The data contradict constraints ({names}): without them the sum of squared residuals and "
+            f"penalty is {three_digits(without)} instead of {three_digits(held)}. {conditional}Check the nominal "
+            "parameters, or loosen the constraints."
         )
 
     # --- the robot that was found ------------------------------------------------------------------------------
@@ -359,7 +359,7 @@ class Outcome:
 
     @cached_property
     def squares(self) -> LinearModel:
-        """The equations whose squares the fit amounts to, multiplied by a factor."""
+        """The equations of the loss's quadratic model at the solution, multiplied by a factor."""
         program = self.program
         source = in_parts(self.problem)
         if self._reweighed:
@@ -396,7 +396,7 @@ class Outcome:
         if not self.program.linear_penalty:
             return f"the penalty {of} is not quadratic; only a normal prior has a posterior covariance"
         if self.known_covariance is None:
-            return f"the loss {of} depends on a few equations, or has own variables, and no quadratic model"
+            return f"the loss {of} has no quadratic model: it depends on a few equations or has variables of its own"
         return ""
 
     def no_covariance(self, instead: str) -> InputError:

@@ -79,7 +79,8 @@ MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), 
 UNUSUAL = {"length": 0.004, "angle": 0.05}
 """Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
 SCALED = 0.002  # common deviation of the longest link [m] from which a wrong scale is the likelier reason
-MOST_SCALED = 0.3  # common deviation beyond which no scale is off: other units are looked for by themselves
+UNSCALED, MOST_SCALED = 0.005, 0.3
+"""Common deviation from which on no machined robot has it, and beyond which no scale is off, but a unit."""
 SIGMAS, COMMON = 3.0, 0.6  # standard deviations of it that chance does not make, and its least part of all deviations
 ALIKE = 0.045  # part of an effect on the data that others may leave where these do not distinguish them
 DEPENDENT = 1e-6  # singular value of effects, over the largest, below which they are combinations of the others
@@ -101,7 +102,9 @@ SCALES = 10.0  # scales by which a parameter of the robot may deviate
 LARGEST_CURVE = 0.01  # standard deviation of transmission errors [rad] beyond any gear: real ones are below 1 mrad
 LARGEST = {"length": 0.02, "angle": 0.05}  # a machined and assembled robot deviates by less than this [m, rad]
 ARM = ("compliance", "bend", "ecc", "transmission")  # beginnings of extension parameters that are the arm's own
-NOTHING = "None of the tested input mistakes explains it. Check the nominal parameters and the arm: is it compliant?"
+NOTHING = (
+    "None of the tested input mistakes explains the residuals. Check the nominal parameters; is the arm compliant?"
+)
 
 
 @dataclass(frozen=True)
@@ -163,14 +166,17 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     limited. Where the formulation limits the fit, other reasons than held-out rows follow from that, and are not named.
     """
     mapping = result.mapping.caution if result.mapping else ""
-    conditions = (mapping, result.contradiction, ambiguous_deviation(result), *_little_motion(result))
+    stretch = _stretch(result)
+    scaled = [_like_a_scale(result, stretch)] * (abs(stretch) > UNSCALED)
+    ambiguous = [] if scaled else [ambiguous_deviation(result)]
+    conditions = (mapping, result.contradiction, *ambiguous, *_little_motion(result))
     caution = " ".join(filter(None, conditions))
     limited = tuple(text for text in causes if LIMITED in text)
     if limited:
         return Verdict((*limited, *_worse(result)), caution)
     reasons = [] if result.converged else [result.message]
     kept = kept_rows(result)
-    reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result)]
+    reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result, bool(causes)), *scaled]
     out = {*np.array(result.problem.labels)[~kept].tolist(), *(row.label for row in result.left_out)}
     rows = len(out.union(result.problem.labels))
     if len(out) > EXCLUDED * rows:
@@ -190,11 +196,11 @@ def ambiguous_deviation(result: Outcome) -> str:
     worst = int(size.argmax())
     stated = _taking_part(result, worst) if result.problem.keeps_rows and size[worst] >= 1 else []
     if not stated:
-        return _like_a_scale(result)
+        return _like_a_scale(result, _stretch(result))
     return (
         f"{free.names[worst]} deviates by {in_unit(result.x[worst], free.dimensions[worst])}, which the data do not "
-        f"distinguish from an error of the stated {joined(stated)}: check it. If it is wrong, this robot is right only "
-        "together with it."
+        f"distinguish from an error of the stated {joined(stated)}: check the stated value. If that is wrong, the "
+        "identified parameters are valid only in combination with it."
     )
 
 
@@ -206,8 +212,8 @@ def _little_motion(result: Outcome) -> Iterator[str]:
     still = [text for name, arm in result.problem.arms.items() for text in hardly_moved(arm, result.ranges[name])]
     if still:
         yield (
-            f"Too little motion: {joined(still)}. The result holds only near the values that were measured there; "
-            "before using others, measure configurations in which these joints move."
+            f"Too little motion: {joined(still)}. The result is valid only near the measured values of these "
+            "joints; measure configurations in which they move before using other values."
         )
     problem = result.problem.sample()
     if not result.record.earlier and any(
@@ -219,28 +225,36 @@ def _little_motion(result: Outcome) -> Iterator[str]:
         )
 
 
-def _like_a_scale(result: Outcome) -> str:
-    """Return a sentence if the lengths of a robot deviate in common, as by the scale of what measured them."""
+def _stretch(result: Outcome) -> float:
+    """Return the common deviation of a robot's lengths, as by the scale of what measured them; 0 where there is none."""
     free, C = result.problem.parameters.free, result.known_covariance
-    if C is None or any(_residuals(result, kept_rows(result))):  # of rows that do not fit deviations say nothing
-        return ""
+    # of rows that do not fit, and of another robot, deviations say nothing
+    if C is None or any(_residuals(result, kept_rows(result))) or any(_deviations(result)):
+        return 0.0
     lengths = (np.array(free.dimensions) == "length") & ~free.of_frames & (free.nominal != 0) & np.isfinite(np.diag(C))
     if not lengths.any():
-        return ""
+        return 0.0
     nominal, x = free.nominal[lengths], result.x[lengths]
     scale = free.scale if result.learned is None else result.learned.stated
     precision = np.linalg.inv(C[np.ix_(lengths, lengths)] + np.diag(scale[lengths] ** 2))  # of deviations found
     information = nominal @ precision @ nominal
     stretch = float(nominal @ precision @ x / information)
     chance = max(SIGMAS**2, COMMON * float(x @ precision @ x))
-    if np.abs(stretch * nominal).max() < SCALED or abs(stretch) > MOST_SCALED or stretch**2 * information < chance:
+    seen = np.abs(stretch * nominal).max() >= SCALED and stretch**2 * information >= chance
+    return stretch * bool(seen and abs(stretch) <= MOST_SCALED)
+
+
+def _like_a_scale(result: Outcome, stretch: float) -> str:
+    """Return the sentence on a common deviation of all lengths; empty for none."""
+    if not stretch:
         return ""
     what = "an instrument of another scale: check its units and its compensation"
     if scaled_by_board(result):
         what = "a board of another size, which views do not identify: measure it over all its squares"
     return (
-        f"Lengths of the robot deviate by {100 * stretch:+.2g} % in common, as with {what}. "
-        "If that is wrong, this robot is wrong by as much."
+        f"Lengths of the robot deviate by {100 * stretch:+.2g} % in common, as with {what}. If that is the cause, the "
+        "identified lengths are wrong by the same percentage; if the robot is of that size, multiply the lengths in "
+        f"its file by {1 + stretch:.4f}."
     )
 
 
@@ -389,8 +403,8 @@ def _repeatability(result: Outcome) -> Iterator[str]:
             )
 
 
-def _deviations(result: Outcome) -> Iterator[str]:
-    """Say which machined parameter deviates most, where no robot is machined so."""
+def _deviations(result: Outcome, named: bool = False) -> Iterator[str]:
+    """Say which machined parameter deviates most, where no robot is machined so, and why if no cause is ``named``."""
     p = result.problem.parameters
     types = [(robot, *each) for robot, arm in result.problem.arms.items() for each in enumerate(arm.joint_types, 1)]
     zeros = {p.called(robot, f"d{joint}") for robot, joint, kind in types if kind == "prismatic"}
@@ -403,7 +417,8 @@ def _deviations(result: Outcome) -> Iterator[str]:
     if size[i] > 1:
         unit, largest = MACHINED[kinds[i]]
         said = f"{p.free.names[i]} deviates by {three_digits(1e3 * result.x[i])} {unit}"
-        yield f"{said}: manufacturing errors stay below {1e3 * largest:g} {unit}. {_cause(result, i, largest)}"
+        cause = "" if named else _cause(result, i, largest)
+        yield f"{said}: manufacturing errors stay below {1e3 * largest:g} {unit}. {cause}".rstrip()
 
 
 def _cause(result: Outcome, i: int, largest: float) -> str:
@@ -481,7 +496,7 @@ def _computed(result: Outcome) -> Iterator[str]:
     elif min(rounding) > 0 and nominal < ROUNDED * np.hypot(
         max(rounding), sum(each.made for each in every_rounding(problem.sample()) if each.step)
     ):
-        beside = "no more than rounding makes: the data seem to be computed from this robot, or have too few decimals."
+        beside = "no more than rounding causes: the data seem to be computed from this robot, or have too few decimals."
     if beside:
         yield f"The error of the nominal robot is {1e3 * nominal:.2g} mm RMS, {beside}"
 
@@ -538,7 +553,7 @@ def likely_causes(result: Outcome) -> list[str]:
         ]
         ignored = result.record.details.get("ignored_joints")
         if ignored:
-            state = "state another robot, or a link behind them (--urdf-tip), if these move the tool"
+            state = "state another robot, or a tip link beyond these joints (--urdf-tip), if they move the tool"
             causes.insert(0, f"joint values {ignored} are ignored, since the robot has {problem.robot.dof}: {state}.")
         shared += together
     elif (other := _other_robot(result, problem)) is not None:

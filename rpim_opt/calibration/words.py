@@ -190,8 +190,8 @@ def underdetermined(result: Outcome) -> list[str]:
     if not names:
         return []
     return [
-        f"{joined(names)} are redundant: the data determine a combination; either value and its uncertainty rest "
-        f'on stated start and scale. State one: [prior] known = ["{names[-1]} = ... +- ..."].'
+        f"{joined(names)} are redundant: the data determine a combination; each value and its uncertainty rest "
+        f'on its nominal value and prior scale. State one (1 sigma): [prior] known = ["{names[-1]} = ... +- ..."].'
     ]
 
 
@@ -312,7 +312,8 @@ def camera_remarks(result: Outcome) -> list[str]:
     before, after = (rms(errors(dimension="pixel")) for errors in (result.nominal_errors, result.errors))
     remarks = [
         f"Reprojection error (RMS): {before:.3g} px before, {after:.3g} px after; errors in mm are distances of the "
-        "line of sight from the point. It measures how well views agree, not how well the robot is identified."
+        "line of sight from the point. The reprojection error measures how well views agree, not how well the robot is "
+        "identified."
     ]
     lens = improvement(result)
     if lens is None:

@@ -13,8 +13,10 @@ from rpim_opt.basics.units import LARGEST, SMALLEST, UNITS
 
 ACCEPTED = {
     "constraint": "'d2 + d3 = 850.00 +- 0.05 mm', '|a2 - a3| <= 0.1 mm', 'alpha2 >= 89.9 deg', "
-    "'d5 = nominal +- 0.1 mm', 'norm(tool_x - 10 mm, tool_y) <= 0.05 mm', or 'move at most 5 mm: workspace'",
-    "prior": "'a2 + a3 = 612.3 +- 0.05 mm', 'a2 - 0.5 a3 = nominal +- 0.05 mm', or 'd5 +- 0.1 mm'",
+    "'d5 = nominal +- 0.1 mm' (+- is a limit), 'norm(tool_x - 10 mm, tool_y) <= 0.05 mm', or 'move at most 5 mm: "
+    "workspace'",
+    "prior": "'a2 + a3 = 612.3 +- 0.05 mm' (+- is one standard deviation), 'a2 - 0.5 a3 = nominal +- 0.05 mm', or "
+    "'d5 +- 0.1 mm'",
 }
 LONGEST = 20_000
 """Characters of a statement: some thousand parameters."""
@@ -248,7 +250,9 @@ class _Reader:
         while sign := self._next("+", "-"):
             total = total.plus(self._item(sign))
         if total.nominal not in (0, -1 if total.names else 1):
-            raise self._wrong("nominal, meaningless here", "'d5 = nominal +- 0.1 mm', '|a2 - nominal| <= 0.1 mm'")
+            raise self._wrong(
+                "nominal, which has no meaning here", "'d5 = nominal +- 0.1 mm', '|a2 - nominal| <= 0.1 mm'"
+            )
         return total
 
     def _item(self, sign: str) -> Sum:

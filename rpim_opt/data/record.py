@@ -84,11 +84,12 @@ class Fit(NamedTuple):
 
     @property
     def likely(self) -> bool:
-        """Whether chance explains it."""
+        """Whether the errors are consistent with chance."""
         return self.probability >= UNLIKELY
 
     def __str__(self) -> str:
-        return f"chi-squared {three_digits(self.squares)} of {self.equations}, p-value {self.probability:.2g}"
+        squares = f"chi-squared {three_digits(self.squares)}"
+        return f"{squares}, {self.equations} degrees of freedom, p-value {self.probability:.2g}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,7 +70,7 @@ class Feature:
 
     @property
     def level(self) -> Feature:
-        """The feature with all touches on it, and parallel to planes that should be: nominal errors are no noise."""
+        """The feature with all points on it, planes parallel as stated: nominal errors are not taken for noise."""
         return replace(self, height=np.zeros_like(self.height), axis=None)
 
     @cached_property
@@ -281,7 +281,7 @@ class Touches:
 
 
 def contrasted(touches: Touches, stacks: Sequence[Stack], stop: np.ndarray) -> list[Stack]:
-    """Return the noise components of the contrasts, from the equations' ``stacks`` and numbers (m,) of stops."""
+    """Return the noise components of the contrasts, from the equations' ``stacks`` and their configurations (m,)."""
     mask, noise = touches.kept, touches.noise()
     place = np.cumsum(mask) - 1
     own = np.ones(touches.equations, dtype=bool)

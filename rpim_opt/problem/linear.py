@@ -109,7 +109,7 @@ NARROW, WIDE, MANY = 8, 32, 100
 
 
 def reduced_rows(rows: Array, R: Array | None = None) -> Array:
-    """Return the QR factor R (n+1, n+1) of R over ``rows`` (m, n+1): LAPACK's blocked QR, twice as fast as QR."""
+    """Return the QR factor R (n+1, n+1) of R over ``rows`` (m, n+1): LAPACK's blocked QR, twice as fast as NumPy's."""
     n = rows.shape[1]
     above = np.zeros((0, n)) if R is None else R
     stacked = np.zeros((max(len(above) + len(rows), n), n), order="F")

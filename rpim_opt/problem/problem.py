@@ -134,7 +134,7 @@ class RobotModel(Tabled):
         return replace(self, robots=robot, parameters=replace(whole, identified=whole.identified | added))
 
     def with_transmission(self, curves: Sequence[Curve]) -> Self:
-        """Return the same problem with transmission errors, one a joint or none, and no repeatability of before."""
+        """Return the problem with the transmission errors of joints (or none), without its previous repeatability."""
         own = [term for term in self.robot.model.terms if not isinstance(term.made_of, Curve)]
         former = {name for curve in self.robot.model.curves for name in transmission(curve).names(curve.joint)}
         p = self.parameters.take(np.flatnonzero([name not in former for name in self.parameters.names]))

@@ -58,7 +58,7 @@ Kept = dict[tuple[Structure, Measurement], Functions]
 
 
 def row_functions(structure: Structure, measurement: Measurement, kept: Kept) -> Functions:
-    """Return the functions of a row: of ready measurements built once, of a user's as they are, or will be, kept."""
+    """Return the functions of a row, built once; those of a user's measurement types and terms are kept in ``kept``."""
     if measurement in _READY and all(term.ready for term in structure.terms):  # they depend on nothing else
         return _ready(structure, measurement)
     if (structure, measurement) not in kept:
@@ -281,7 +281,9 @@ def require_loads(robot: Robot, parameters: Parameters, blocks: Sequence[Block])
 def require_same_torques(robot: Robot, parameters: Parameters, before: bool, now: bool) -> None:
     """Refuse other torques than a problem has where compliances need them: gravity's are on guessed masses."""
     if before != now and needed(robot, parameters).torques:
-        accepted = "columns tau1_Nm, ... in all data or in none: torques of gravity are others"
+        accepted = (
+            "columns tau1_Nm, ... in all data or in none: torques computed from gravity differ from measured ones"
+        )
         raise InputError("compliances", f"data {'with' if now else 'without'} joint torques", accepted)
 
 
@@ -296,7 +298,7 @@ def require_known_masses(robot: Robot, parameters: Parameters, data: Dataset, pa
     low, high = min(map(np.min, carried)), max(map(np.max, carried))
     if payload.min() < low or payload.max() > high:
         measured = " to ".join(dict.fromkeys((f"{low:g}", f"{high:g}")))
-        found = f"{payload.max():g} kg, where {measured} kg were measured and masses of the links are guessed"
+        found = f"{payload.max():g} kg; measured with {measured} kg, and the masses of the links are assumed"
         accepted = "a payload that was measured, or a calibration with mass_kg and centre_x_mm, ... of the links"
         raise InputError("payload", found, accepted)
 

@@ -287,5 +287,7 @@ def visible_configurations(
         visible = np.concatenate([visible, q[before & inside & large & upright]])
         if len(visible) >= count:
             return visible[:count]
-    accepted = "frames, a share and an image for which it is visible more often"
+    accepted = (
+        "other frames of camera and board, a smaller share of the image or a larger image: it is visible too rarely"
+    )
     raise InputError("visible_configurations", f"{len(visible)} of {count} views with a visible board", accepted)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def show(text: str | dict[str, Any], stream: TextIO | None = None) -> None:
-    """Print a text without control characters, or a document; a reader that went away changes no exit code."""
+    """Print a text without control characters, or a document; a closed pipe does not change the exit code."""
     stream = stream or sys.stdout
     lines = visible(text if isinstance(text, str) else json_text(text).rstrip("\n")).split("\n")
     if stream and stream.isatty():  # break sentences at words; rows of tables, with wider gaps, stay lines

@@ -228,10 +228,11 @@ def _error_figure(result: Calibration, name: str, data: Dataset) -> Figure:
 
 def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
     notes = [
-        "U is the radius about the predicted position that contains the position reached, from the uncertainty of the "
-        "parameters and the robot's repeatability, without the instrument's noise (GUM). Each square shows the maximum "
-        "of the configurations that reach it, at any depth. Axes of the robot's base. Not included are effects that no "
-        "reading varied: the instrument's scale, temperature and other loads than the measured ones."
+        "U is the radius about the predicted position that contains the position reached with the stated confidence. "
+        "It includes the uncertainty of the parameters and the robot's repeatability, not the instrument's noise "
+        "(GUM), nor effects that no reading varied: the instrument's scale, temperature and other loads than those "
+        "measured. Each square shows the maximum of the configurations that reach it, at any depth. Axes are those of "
+        "the robot's base."
     ]
     limit, box, frame = np.inf, None, ""
     if result.record.requirement is None:
@@ -311,7 +312,10 @@ def _parameters(content: Content) -> Iterator[Block]:
         of, values, _ = Prior.known(text).statements[0].on(result.problem.parameters)
         known += [[text, f"{off:+.2f}"] for off in of @ result.z - values]
     if known:
-        yield "table", Table("Known values", ["stated", "identified minus stated, in standard deviations"], known)
+        yield (
+            "table",
+            Table("Known values", ["stated", "identified minus stated, in stated standard deviations"], known),
+        )
     curves = transmission_errors(result)
     if not curves:
         return

@@ -53,7 +53,7 @@ def error_rows(result: Calibration) -> list[dict[str, Any]]:
         what = f"{name}, from {held.used} rows"
         rows += [_figures(f"{what}, nominal", nominal), _figures(f"{what}, identified", identified)]
         if len(identified) < len(held.label):
-            rows.append(_figures("held out with excluded rows, identified", held.error))
+            rows.append(_figures("held out, including excluded rows, identified", held.error))
     return rows
 
 

@@ -155,7 +155,7 @@ class Robot(Brief):
         require(largest <= FARTHEST, "mdh", f"{largest:g}", f"magnitudes of at most {FARTHEST:g} m or rad")
         types = tuple(self.joint_types) or ("revolute",) * n
         right = len(types) == n and set(types) <= {"revolute", "prismatic"}
-        require(right, "joint_types", repr(types), f"{n} times revolute or prismatic")
+        require(right, "joint_types", repr(types), f"{n} entries, each revolute or prismatic")
         joint_map = _frozen(self.joint_map if np.size(self.joint_map) else np.eye(n))
         right = joint_map.ndim == 2 and len(joint_map) == n >= joint_map.shape[1]
         right = right and bool((np.abs(joint_map) <= LARGEST).all())

@@ -156,7 +156,7 @@ def _rows(data: Dataset, labels: Any, where: str = "") -> Array:
 
 
 class PriorTable(Table):
-    """The keys of ``[prior]``; tails may be infinite."""
+    """The keys of ``[prior]``; the degrees of freedom of Student's t may be infinite (a normal prior)."""
 
     model_config = ConfigDict(allow_inf_nan=True)
 

@@ -108,7 +108,9 @@ def compare(
     numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0)
     figured = metrics_of(metrics)
     if next(iter(figured)) == COVERED:
-        raise InputError("metrics", f"'{COVERED}' first, of which 95 is best", "first one of which less is better")
+        raise InputError(
+            "metrics", f"'{COVERED}' first, of which 95 is best", "a first metric of which smaller values are better"
+        )
 
     def work(case: Mapping[str, Any]) -> studies.Work:  # which takes no more along than it needs
         return partial(replicate, asked[case["problem"]], ways[case["split"]], compared[case["method"]], figured, case)

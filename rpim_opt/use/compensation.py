@@ -139,7 +139,9 @@ class Compensation:
         said = "{} of {} commands {}; do not execute these rows."
         lines += [said.format(count, len(self.q), what) for what, count in counts.items() if count]
         if len(self.missed) > uncertain and np.isfinite(self.orientation_error).any():
-            lines.append("Position comes first without --orientation, and alone counts with --position-only.")
+            lines.append(
+                "Without --orientation, position has priority; with --position-only only the position is corrected."
+            )
         vague = EXPANDED * self.std > self.position_before
         if vague.mean() > 0.5 and np.isfinite(self.std).all():
             lines.append(
@@ -322,7 +324,7 @@ def compensate(
     whole, why = _corrected(cell, targets, largest, orientation)
     point = cell.point + why
     if oriented and not turns_measured(cell.problem):
-        point += " Positions of one reflector determine only part of an orientation, the prior the rest."
+        point += " Positions of one reflector determine only part of an orientation; the prior determines the rest."
     expanded = EXPANDED * np.nan_to_num(whole["std"], posinf=0.0)
     above = (whole["position_error"] + expanded > limit) & (whole["status"] != UNREACHABLE)
     reached = Dataset.of(whole["q"], np.zeros((len(expanded), 3)), 1.0)
@@ -342,7 +344,7 @@ def compensate(
         if whole["std"][row] > LESS_KNOWN * known:
             at_tool, at_reflector = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (whole["std"][row], known))
             point += (
-                f" In row {targets.label[row]}, U is {at_tool} at the tool and {at_reflector} at the reflector. "
+                f" In row {targets.label[row]}, U (k = 2) is {at_tool} at the tool, {at_reflector} at the reflector. "
                 "Measure a reflector as far from the flange as this point, and state what is known of the flange "
                 "(`known` in [prior]), which the data do not separate from the tool."
             )

@@ -216,8 +216,8 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
     bound, required = float((found.expanded + stays).max()), found.requirement
     of_geometry = (
         "Expanded uncertainty of the position that the reflector reaches with this geometry (U, "
-        f"{percent(required.confidence)}): at most {1e3 * bound:.3f} mm; region: {required.where}. It includes what "
-        f"geometry alone misses, at most {1e3 * stays.max():.3f} mm there."
+        f"{percent(required.confidence)}): at most {1e3 * bound:.3f} mm; region: {required.where}. It includes the "
+        f"error of leaving out the model extensions, at most {1e3 * stays.max():.3f} mm there."
     )
     if accepted and bound > required.limit:
         undecided = True
@@ -408,7 +408,9 @@ def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path
 def _write_ur_kinematics(result: Calibration, robot: str, marker: str | None, source: Path, target: Path) -> list[str]:
     nominal = result.problem.arms[robot]
     arm, notes = _on_base(identified(result, marker, robot), nominal, read_ur_kinematics(source).robot, target)
-    notes.append("The ROS driver reads these origins; the controller keeps its own kinematics, and the hash stays.")
+    notes.append(
+        "The ROS driver reads these origins; the controller keeps its own kinematics, and the hash is unchanged."
+    )
     return [*notes, _of_controller(arm), *write_ur_kinematics(source, arm.robot, target)]
 
 
@@ -435,7 +437,9 @@ def _write_ur_calibration(result: Calibration, robot: str, marker: str | None, s
     if b"joint_checksum" in read_bytes(source):
         notes.append("joint_checksum is that of the source: a controller may refuse the file. Keep the original.")
     if not np.array_equal(mdh, arm.robot.mdh):
-        notes.append("Without the tilt and offset of axis 1 (alpha1, a1): the Base of calibration.conf is on it.")
+        notes.append(
+            "calibration.conf cannot hold the tilt and offset of axis 1 (alpha1, a1): its Base is defined on axis 1."
+        )
     return [*notes, _of_controller(replace(arm, base=frame_numbers(numeric_frame(arm.base) @ axis)))]
 
 

@@ -96,7 +96,11 @@ def _targets(robot: Robot, understanding: Interpretation) -> Targets:
         raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
     if "rx_rad" in columns and not joints and any(each.doubt == "rotation" for each in understanding.tables):
         accepted = "--rotation vector (Universal Robots), or --rotation 'extrinsic xyz' (roll, pitch, yaw)"
-        raise InputError("the header", "rx, ry, rz in rad, which joint values would tell apart", accepted)
+        raise InputError(
+            "the header",
+            "rx, ry, rz in rad without joint values, which would tell a rotation vector from angles",
+            accepted,
+        )
     if not joints and not positions:
         raise InputError("the header", "no targets", "columns q1_deg, ..., or x_mm, y_mm, z_mm, or both")
     absent = [*joint_columns(robot.joint_dimensions)] * (not joints) + ["x_mm", "y_mm", "z_mm"] * (not positions)
@@ -109,7 +113,7 @@ def _targets(robot: Robot, understanding: Interpretation) -> Targets:
     if others:
         raise InputError("column marker", "several reflectors", "targets of one")
     if block.approach is not None:
-        accepted = "none: joints are in the middle of their backlash"
+        accepted = "none: compensation assumes the middle of the backlash"
         raise InputError("column approach1", "directions of approach", accepted)
     torque = None if block.torque is None else block.torque[:, 0]
     stated = {"q": joints, "poses": positions}

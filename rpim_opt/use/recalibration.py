@@ -428,9 +428,10 @@ def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple
         return likely if left - motion > AS_GOOD else moved
     names = [best.name, *(cause.name for cause in others if cause.gain > best.gain - AS_GOOD)]
     return (
-        f"Likely: {', or '.join(names)} changed: that leaves chi-squared {three_digits(left)} of "
-        f"{fit.equations - len(best.members)}, and a motion of the instrument or the base {three_digits(motion)} of "
-        f"{fit.equations - len(base.members)}. Recalibrate by `update`; --register would hide the change."
+        f"Likely: {', or '.join(names)} changed: that leaves chi-squared {three_digits(left)} with "
+        f"{fit.equations - len(best.members)} degrees of freedom, a motion of the instrument or the base "
+        f"{three_digits(motion)} with {fit.equations - len(base.members)}. Recalibrate by `update`; --register would "
+        "hide the change."
     ), ""
 
 

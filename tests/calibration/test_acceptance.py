@@ -180,7 +180,7 @@ def test_the_mean_of_the_errors_does_not_decide(result) -> None:
     assert f"Held out: 40 rows, 40 of them in the region, maximum error there {1e3 * largest:.3f} mm (up to" in str(
         found
     )
-    assert "their 95 % prediction intervals (chi-squared 11 of 120, p-value 1)." in str(found)
+    assert "their 95 % prediction intervals (chi-squared 11, 120 degrees of freedom, p-value 1)." in str(found)
 
 
 def test_held_out_rows_may_be_elsewhere(result) -> None:
@@ -489,7 +489,7 @@ def test_joints_that_stood_are_named(tmp_path: Path) -> None:
     y = problem.modelled(np.zeros(len(problem.parameters.free)))[0][:, :3]
     noise = 5e-5 * np.random.default_rng(0).normal(size=y.shape)
     still = ro.calibrate(problem.on(ro.Dataset.of(q[:, 0], y + noise, 5e-5)), "tikhonov", 1.0)
-    said = "The result holds only near the values that were measured there"
+    said = "The result is valid only near the measured values of these joints"
     assert said in str(ro.calibration.accept(still, ro.data.Requirement(1e-3)))
     assert said in str(still)
     exported = ro.use.export_files(still, mdh=tmp_path / "arm.csv", despite_verdict=True)
@@ -510,4 +510,4 @@ def test_a_deviation_that_may_be_an_error_of_the_stated_tool_is_not_accepted() -
     (reason,) = acceptance.reasons
     assert reason.startswith("Missing: a check of the frame or scale")
     moved = ro.use.compensate(result, instance.validation.q, tool=[0.1, 0, 0.2, 0, 0, 0])
-    assert "an error of the stated tool_z: check it." in str(moved)
+    assert "an error of the stated tool_z: check the stated value." in str(moved)

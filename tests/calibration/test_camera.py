@@ -67,14 +67,15 @@ def test_a_result_tells_reprojection_from_positions() -> None:
     assert found.before == pytest.approx(world, rel=0.2)
 
 
-def test_a_board_of_another_size_is_a_condition(tmp_path: Path) -> None:
+def test_a_board_of_another_size_is_refused(tmp_path: Path) -> None:
     """Its squares are stated 1 % too large, and so all links become; with the right ones nothing is said."""
     folder = shutil.copytree(FOLDER, tmp_path / "camera")
     problem = (folder / "problem.toml").read_text()
     (folder / "problem.toml").write_text(problem.replace("spacing_mm = 40 ", "spacing_mm = 40.4 "))
     instance = ro.load(folder)
-    caution = ro.calibrate(instance.problem, "tikhonov", weight="learned").verdict.caution
-    stretch = re.match(r"Lengths of the robot deviate by \+(0\.\d+) % in common", caution)
+    verdict = ro.calibrate(instance.problem, "tikhonov", weight="learned").verdict
+    assert not verdict.delivered
+    stretch = re.match(r"Lengths of the robot deviate by \+(0\.\d+) % in common", verdict.reasons[0])
     assert stretch
     assert 0.7 < float(stretch[1]) < 1.3
     assert not calibrated()[1].verdict.caution

@@ -177,7 +177,7 @@ def test_a_robot_that_bends_is_no_mistake() -> None:
     noisy = values(lambda y: y + 2e-3 * rng.normal(size=y.shape))(problem)
     causes = likely_causes(calibrated(noisy))
     assert len(causes) == 2
-    assert causes[1].startswith("None of the tested input mistakes explains it")
+    assert causes[1].startswith("None of the tested input mistakes explains the residuals")
 
 
 def test_validation_rows_that_are_identification_rows_are_named() -> None:
@@ -271,7 +271,7 @@ def braced(change):
         ("iiwa7", joints(lambda q: q[..., [0, 1, 6, 2, 3, 4, 5]]), "joints in the order q1, q2, q7, q3, q4, q5, q6"),
         ("iiwa7", joints(lambda q: q[..., ::-1]), "joints in the order q7, q6, q5, q4, q3, q2, q1"),
         ("irb120", values(lambda y: stations(y)), "from about row P55 on the points fit another base"),
-        ("irb120", values(lambda y: np.where(SECOND, y[:, [1, 0, 2]], y)), "P2, P4, .* fit otherwise: .* mirrored"),
+        ("irb120", values(lambda y: np.where(SECOND, y[:, [1, 0, 2]], y)), "P2, P4, .* fit if read otherwise: .* mirrored"),
         ("iiwa7", NEARER, "from row P4. on measured distances are -12"),
         ("iiwa7", braced(NEARER), "from row {P4.} on measured distances are -12"),
         ("ur5e", of_joint(0, lambda q: (q + np.pi / 2) % np.pi - np.pi / 2), "wrong values of joint 1"),
@@ -512,7 +512,11 @@ def of_another_nest(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
 
 COUNTED = "between table and robot file: "
 OF_THE_SHEET = {
-    "a length of the other sign": ("a_mm = -425", "a_mm = 425", f"{COUNTED}a3 of the other sign in the robot file, or"),
+    "a length of the other sign": (
+        "a_mm = -425",
+        "a_mm = 425",
+        f"{COUNTED}a3 with the opposite sign in the robot file, or",
+    ),
     "a theta of 90 degrees": ("a_mm = -425", "a_mm = -425\ntheta_deg = 90", f"{COUNTED}zero of joint 3 -90.0 deg. "),
 }
 OF_THE_TABLE = {
@@ -704,7 +708,7 @@ def test_rows_here_and_there_that_another_interpretation_fits_are_named() -> Non
     some = np.arange(80)[:, None, None] % 4 == 1
     wrong = joints(lambda q: np.where(some, q[..., [0, 2, 1, 3, 4, 5]], q))(simulated_arm("irb120", count=80))
     (said,) = other_rows(wrong)
-    assert re.match("rows P2, P6, P10, .* more fit otherwise: .* joints 2 and 3 exchanged", said)
+    assert re.match("rows P2, P6, P10, .* more fit if read otherwise: .* joints 2 and 3 exchanged", said)
 
 
 def test_measured_points_of_a_grid_are_not_called_filled_in_whatever_their_unit() -> None:

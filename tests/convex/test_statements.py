@@ -72,7 +72,7 @@ def test_a_statement_means_what_it_says(text: str, meaning: Sentence) -> None:
         ("norm a2 <= 1 mm", "norm without ("),
         ("norm(a2, a3 <= 1 mm", "no closing )"),
         ("a2 + a2 = 1 mm", "'a2' twice"),
-        ("a2 + nominal = 1 mm", "nominal, meaningless here"),
+        ("a2 + nominal = 1 mm", "nominal, which has no meaning here"),
         ("a2 - nominal = nominal", "nominal on both sides"),
         ("2 nominal <= a2", "2 nominal"),
         ("1 mm <= 3 mm", "no parameter"),

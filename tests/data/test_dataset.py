@@ -82,7 +82,7 @@ def test_limits_carry_the_unit_of_their_joint(tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match=r"joint 1.limits_deg: found a unit that does not fit.*limits_mm"):
         ro.read_robot(path)
     path.write_text('name = "r"\ncoupling = [[1, 0]]\n[[joint]]\n')
-    with pytest.raises(ro.InputError, match=r"coupling: .* 1 rows of 1 numbers"):
+    with pytest.raises(ro.InputError, match=r"coupling: .* 1 rows of equal length, at most 1 number"):
         ro.read_robot(path)
 
 

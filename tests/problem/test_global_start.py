@@ -267,7 +267,7 @@ def test_a_length_of_the_wrong_sign_is_no_matter_of_the_joints_alone(name: str) 
     parameters = replace(problem.parameters, nominal=nominal)
     wrong = ro.CalibrationProblem(replace(problem.robot, mdh=mdh), parameters, problem.data)
     result = ro.calibrate(wrong)
-    assert f"robot file: {name} of the other sign in the robot file, or " in result.verdict.caution
+    assert f"robot file: {name} with the opposite sign in the robot file, or " in result.verdict.caution
     assert result.verdict.caution.endswith(f"Check the sign of {name} first.")
     assert inspect(wrong).judgement[0] == result.verdict.caution
     assert not ro.calibrate(problem).verdict.caution

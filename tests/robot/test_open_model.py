@@ -342,7 +342,7 @@ def test_files_hold_the_geometry_of_a_calibration_without_a_users_term(
     found = ro.calibrate(own, weight=weight)
     written = ro.use.export_files(found, mdh=tmp_path / "arm.toml")
     assert "Files cannot hold own2, own3, own4: their geometry is from a separate fit" in " ".join(written.notes)
-    assert "It includes what geometry alone misses, at most 0." in " ".join(written.notes)
+    assert "It includes the error of leaving out the model extensions, at most 0." in " ".join(written.notes)
     rigid = ro.calibrate(blank().on(own.data), weight=weight)
     assert np.abs(ro.read_robot(tmp_path / "arm.toml").mdh - rigid.robot.mdh).max() < 1e-9
     known = own.parameters.names.index("own2")  # stated by the problem, not identified

@@ -126,7 +126,7 @@ def test_uncertainty_of_exported_geometry_contains_what_files_cannot_hold(tmp_pa
     said = " ".join(ro.use.export_files(result, mdh=tmp_path / "arm.toml").notes)
     stated, of_gravity = (
         float(re.search(rf"{before} ([\d.]+) mm", said)[1])
-        for before in (r"this geometry \(U, 95 %\): at most", "what geometry alone misses, at most")
+        for before in (r"this geometry \(U, 95 %\): at most", "error of leaving out the model extensions, at most")
     )
     others = np.random.default_rng(3).uniform(q.min(axis=0), q.max(axis=0), (2000, 6))
     alone = ro.use.geometry_alone(result)[0].forward(others)[:, :3, 3]

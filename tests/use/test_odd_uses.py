@@ -180,7 +180,7 @@ PLACES = {"x_mm": [1.0, 2.0], "y_mm": [1.0, 2.0], "z_mm": [1.0, 2.0]}
     ("table", "said"),
     [
         ({**Q, **PLACES, "marker": ["A", "B"]}, "several reflectors, accepted: targets of one"),
-        ({**Q, **PLACES} | {f"approach{i}": [1, -1] for i in range(1, 7)}, "none: joints are in the middle"),
+        ({**Q, **PLACES} | {f"approach{i}": [1, -1] for i in range(1, 7)}, "none: compensation assumes the middle"),
     ],
 )
 def test_targets_that_are_none(table: dict[str, Any], said: str) -> None:

@@ -549,7 +549,7 @@ def _rows_with_values(table: CanonicalTable, robot: Robot, kind: Measurement) ->
         again = next((label for label, count in times.items() if count > 1), "")
         single = [times[label] == 1 for label in own]
         if all(own) and single.count(False) <= REPEATED * len(own):  # a reference point, of other rows in other files
-            notes.append(f"labels are not unique: rows '{again}' have their number behind it.")
+            notes.append(f"labels are not unique: the row number is appended to '{again}'.")
             named = zip(own, single, strict=True)
             columns["label"] = [label if one else f"{label} (row {i})" for i, (label, one) in enumerate(named, start=1)]
         else:

@@ -427,7 +427,7 @@ def _factors(points: Points) -> Iterator[Misreading]:
         factor = unit if abs(factor / unit - 1) < 1e-3 else factor  # the nominal robot is not more exact
         remedy = f"multiply {what} by {factor:.5g}, or name the unit"
         if what == LENGTHS_OF_ALL:
-            remedy += ", or state the right robot: another one's size explains the same"
+            remedy += ", or check that the right robot is named: one of another size would explain the data as well"
         yield Misreading(f"{what} in another unit or scale", remedy, partial(times, what, factor))
 
 

@@ -168,8 +168,8 @@ def _odd_values(problem: CalibrationProblem, points: Points) -> Iterator[str]:
     if apart.sum() > len(apart) / 2:
         what = f"the values of {column} explain nothing (sorted, copied, shuffled, without signs, another quantity?)"
     yield (
-        f"{what}: with fitted ones the points agree to {three_digits(1e3 * left[least] * points.extent)} mm instead "
-        f"of {three_digits(1e3 * whole * points.extent)} mm; check its column."
+        f"{what}: with fitted values the points agree to {three_digits(1e3 * left[least] * points.extent)} mm instead "
+        f"of {three_digits(1e3 * whole * points.extent)} mm; check the column."
     )
 
 
@@ -330,7 +330,7 @@ def other_rows(problem: CalibrationProblem) -> Iterator[str]:
                 return
         better = better_interpretation(problem.on(problem.data.take(some.row)), whole=False)
         if better is not None:
-            where = where or named_rows(problem.data, some.row, "fits otherwise:", "fit otherwise:")
+            where = where or named_rows(problem.data, some.row, "fits if read otherwise:", "fit if read otherwise:")
             yield f"{where} {better.sentence}"
             return
     if not together and not points.lengths and points.turns is None:

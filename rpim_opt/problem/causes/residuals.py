@@ -188,7 +188,7 @@ def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[st
     """Say what an addition means and which part of the residuals it leaves, unless it is no mistake."""
     if best is not None and best[1].said is not None:
         what, remedy = best[1].said(best[2])
-        yield f"{what} (that leaves {100 * best[0]:.0f} % of the residuals): {remedy}."
+        yield f"{what} (that leaves {100 * best[0]:.0f} % of the sum of squares): {remedy}."
 
 
 def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterator[Addition]:
@@ -496,7 +496,7 @@ def _said_of_kinds(problem: CalibrationProblem, rows: np.ndarray, left: float) -
     if np.ptp(rows) == len(rows) - 1:
         named = f"rows {label[rows[0]]} to {label[rows[-1]]} fit"
     return (
-        f"{named} other parameters than the rest (two calibrations leave {100 * left:.0f} % of the residuals): "
+        f"{named} other parameters than the rest (two calibrations leave {100 * left:.0f} % of the sum of squares): "
         "are they of another arm, tool or load, or were their joint values computed for another configuration of wrist "
         "or elbow? Calibrate the two groups separately, or leave one out ([exclude])."
     )
@@ -532,7 +532,7 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
             said = f"backlash, {joined(steps)}"
     if said:
         yield (
-            f"{said}: one of two positions in every row explains the residuals (that leaves {100 * best:.0f} %). "
+            f"{said}: one of two positions in every row leaves {100 * best:.0f} % of the sum of squares. "
             "Approach all configurations from one side, or state the directions of approach (columns approach1, ...)."
         )
 
@@ -569,8 +569,8 @@ def two_states(problem: CalibrationProblem, x: Array, most: float = LOADS) -> It
         if left < best and left * rms(r) < NOTICED and len(rows) >= FEWEST:
             best, fit = left, named_rows(problem.data, rows, "fits", "fit", len(rows))
             said = (
-                f"{fit} another {what} (one of two in every row explains the residuals; that leaves "
-                f"{100 * left:.0f} %): {cause}."
+                f"{fit} another {what} (one of two in every row leaves {100 * left:.0f} % of the "
+                f"sum of squares): {cause}."
             )
     if said:
         yield said

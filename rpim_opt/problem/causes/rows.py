@@ -40,7 +40,7 @@ OUTLYING = 10  # one of so many rows may be an outlier of a calibration
 
 
 def in_table_order(problem: CalibrationProblem, *apart: Dataset | None) -> CalibrationProblem:
-    """Return a problem with rows that were kept apart, all at their places in the table by the numbers in their labels.
+    """Return a problem with its held-out rows put back, in the order of the table by the numbers in their labels.
 
     The problem alone where its own labels do not increase (but for held-out rows behind the others), or parts have
     other labels (P07_A, v7): a table of its own says nothing of neighbouring rows.

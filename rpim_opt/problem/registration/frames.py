@@ -120,7 +120,7 @@ def largest_session(data: Dataset) -> Dataset:
 
 
 def sessions_apart(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> dict[str, float]:
-    """Return the session with the most rows, and those whose instrument or base stood elsewhere; none without these.
+    """Return the session with the most rows, and those with the instrument or base elsewhere; none without sessions.
 
     The nominal robot is registered to the first one, with reflectors starting at ``tools``; a session's figure is the
     RMS distance [m] of its points from there. It stands apart if that is several times what a nominal robot, or the

@@ -102,7 +102,7 @@ class JointMapping:
     def explanations(self) -> str:
         """Return the descriptions of the robot as text: lengths of the other sign, one number each, then mappings."""
         counted = [described(self, each.sign, each.zero) for each in (self, *self.same)]
-        return ", or ".join([*(f"{name} of the other sign in the robot file" for name in self.lengths), *counted])
+        return ", or ".join([*(f"{name} with the opposite sign in the robot file" for name in self.lengths), *counted])
 
     @property
     def caution(self) -> str:
@@ -232,7 +232,7 @@ def explained(points: Points) -> bool:
 
 
 def with_mapping(problem: CalibrationProblem, points: Points, sign: Array, zero: Array) -> CalibrationProblem:
-    """Return the problem with the joints mapped, and base and reflectors where the points put them then."""
+    """Return the problem with the joints mapped, and base and reflectors registered to the points."""
     robot = mapped(problem.robot, sign, zero)
     fit = fit_arms(Candidates.of([replace(points, robot=robot)]), LONG, robust=True)
     p = problem.parameters

@@ -60,7 +60,11 @@ TURNS, NEARLY = {np.pi / 2: "pi/2", np.pi: "pi"}, 0.002
 SIGNS = {"°": "deg", "pi": "rad", "π": "rad"}  # of units in cells
 LARGEST_TURN = 2 * np.pi  # [rad] in a table of a robot's links: larger numbers are degrees
 JOINT_NAME = re.compile(r"(?:joint|axis|link|achse|gelenk)[\s_]*\d+", re.IGNORECASE)  # in a cell
-WITHOUT_COLUMN = {"coupling": "a coupling of joints", "mounting": "a mounting elsewhere", "payload": "a payload"}
+WITHOUT_COLUMN = {
+    "coupling": "a coupling of joints",
+    "mounting": "another mounting than on the floor",
+    "payload": "a payload",
+}
 """What a table with one row per joint has no place for."""
 Mounting = str | list[Annotated[float, Field(strict=False)]]
 """``"floor"``, ``"ceiling"``, ``"wall"``, or where gravity points in the robot's base."""
@@ -137,7 +141,7 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
     dof = len(table.joint)
     coupling = np.eye(dof).tolist() if table.coupling is None else table.coupling
     if len(coupling) != dof or {len(row) for row in coupling} - {len(coupling[0])} or not 0 < len(coupling[0]) <= dof:
-        raise InputError("key coupling", f"{coupling}", f"{dof} rows of {dof} numbers, or all of fewer")
+        raise InputError("key coupling", f"{coupling}", f"{dof} rows of equal length, at most {dof} numbers each")
     limits = [joint.limits or [-np.inf, np.inf] for joint in table.joint]
     for number, pair in enumerate(limits, start=1):
         if len(pair) != 2 or not pair[0] < pair[1]:
