@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -57,7 +57,8 @@ class Monitoring:
     are the errors against the calibration [m]; ``sigmas`` (N,) the innovation of a check, beyond the calibration and
     the checks before it, in standard deviations of a new reading, and ``allowed`` (N,) the limit that one of all N
     rarely exceeds; ``sums`` (N,) their cumulative sum (CUSUM) and ``limit`` what it rarely exceeds. ``drift`` is the
-    change that explains them best, None where chance does; ``mistake`` a likely one in the checks, in a sentence;
+    change that explains them best, None where chance does; ``wrong`` are readings that are better explained by an error
+    of their own, and left out of sums and changes; ``mistake`` is a likely one in the checks, in a sentence;
     ``registered`` states the motions of checks that were registered again.
     """
 
@@ -70,6 +71,7 @@ class Monitoring:
     sums: Array
     limit: float
     drift: Drift | None = None
+    wrong: tuple[recalibration.Cause, ...] = ()
     mistake: str = ""
     registered: str = ""
 
@@ -99,6 +101,7 @@ class Monitoring:
             "since": label.get(self.since),
             "limit": self.limit,
             "moved": self.drift and {**self.drift.content(), "label": label[self.drift.first]},
+            "wrong": [cause._asdict() for cause in self.wrong],
             "mistake": self.mistake,
             "registered": self.registered,
             "rows": records(self._columns()),
@@ -110,9 +113,17 @@ class Monitoring:
 
     def __str__(self) -> str:
         count = f"{len(self.label)} checks"
+        out = {label for cause in self.wrong for label in cause.members}
         lines = [f"No drift in {count}."]
-        if self.drifts:
+        if self.drift or self.alarm is not None or any(self.label[i] not in out for i in self.beyond):
             lines = [f"The robot deviates from its calibration ({count}).", *filter(None, [self.mistake])]
+        elif self.wrong:
+            lines = [f"No drift in {len(self.label) - len(out)} of {count}."]
+        lines += [
+            f"Reading {listed(cause.members)} is wrong by itself: chi-squared falls by {three_digits(cause.gain)}, "
+            f"p-value {cause.p_value:.2g}. Measure it again."
+            for cause in self.wrong
+        ]
         if self.beyond:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
             lines.append(f"Outside the prediction interval of a new reading: {listed(named, between='; ')}.")
@@ -130,7 +141,7 @@ class Monitoring:
             )
             if self.drift.others:
                 lines.append(f"A change of {joined(self.drift.others)} explains the checks as well: measure more.")
-        elif self.drifts:
+        elif self.drifts and not self.wrong:
             lines.append("No single parameter or frame explains the deviation.")
         worst = int(np.argmax(self.sigmas / self.allowed))
         lines.append(
@@ -187,27 +198,27 @@ def monitor(
         data = data.take(order)
         when = when[order]
         times = tuple(times[i] for i in order[: len(times)])
-    # a place that is checked again and again is many configurations: one a visit
-    visit = np.cumsum(np.diff(data.configuration, prepend=data.configuration[0]) != 0)
-    if when is not None:
-        visit = np.unique(when, return_inverse=True)[1]
-    keys = [visit, data.configuration, np.unique(data.session, return_inverse=True)[1]]
-    visits = np.unique(np.stack(keys), axis=1, return_inverse=True)[1].ravel()
+    visit = None if when is None else np.unique(when, return_inverse=True)[1]
     own = np.array([data.session == name for name in set_ups(result, data) if register], float).reshape(-1, count)
     data, motion = registered_again(result, data) if register else (data, "")
-    problem = recalibration.with_data(result, replace(data, configuration=visits))
+    problem = recalibration.with_data(result, recalibration.by_visit(data, visit))
     level = recalibration.FALSE_ALARM / TESTS
     sigmas, deviate, equations = _innovations(result, problem, own, level / count)
+    drift, wrong = _drift(result, problem, own, level)
+    right = ~np.isin(data.label, [label for cause in wrong for label in cause.members])
     held = held_out_errors(result, data)
     if unknown := unregistered(result, data, held):  # which a change of the robot would take up
         raise InputError("the checks", unknown.partition(":")[0].replace("The", "the", 1), "--register")
     return Monitoring(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
         allowed=np.sqrt(equations * fdtri(equations, max(result.noise_dof, 1.0), 1 - level / count)),
-        sums=cusum(deviate), limit=cusum_limit(count, level), drift=_drift(result, problem, own, level),
-        registered=motion,
-        mistake=misread(result, data) or recalibration.moved_or_changed(result, data, held)[0],
+        sums=cusum(deviate * right), limit=cusum_limit(count, level), drift=drift, wrong=wrong, registered=motion,
+        mistake=misread(result, data) or _moved_or_changed(result, data.take(np.flatnonzero(right))),
     )  # fmt: skip
+
+
+def _moved_or_changed(result: Calibration, data: Dataset) -> str:
+    return recalibration.moved_or_changed(result, data, held_out_errors(result, data))[0] if len(data) else ""
 
 
 def _framed(problem: CalibrationProblem) -> tuple[CalibrationProblem, list[int], np.ndarray]:
@@ -293,8 +304,13 @@ def cusum_limit(count: int, level: float) -> float:
     return float(scipy.optimize.bisect(alarms, 1e-3, HIGHEST_LIMIT, xtol=1e-4))
 
 
-def _drift(result: Calibration, problem: CalibrationProblem, own: Array, level: float) -> Drift | None:
-    """Return the change that explains checks best, set-ups moved or not; None where chance does, over all tried."""
+def _drift(
+    result: Calibration, problem: CalibrationProblem, own: Array, level: float
+) -> tuple[Drift | None, tuple[recalibration.Cause, ...]]:
+    """Return the change that explains checks best, set-ups moved or not, and the readings that are wrong by themselves.
+
+    None, or none, where chance explains them, over all that were tried.
+    """
     # a frame may have moved whether it was identified or not: else the robot's parameters are blamed for it
     framed, base, mine = _framed(problem)
     free = framed.parameters.free
@@ -307,29 +323,48 @@ def _drift(result: Calibration, problem: CalibrationProblem, own: Array, level: 
     # rows of one configuration were read together: the first of them has the time
     numbers, first = np.unique(problem.data.configuration, return_index=True)
     when = first[np.searchsorted(numbers, model.group)]
-    misfit = recalibration.Misfit(result, model, form)
     count = len(problem.data)
     moments = np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(int))
     courses = [(int(first), False, (when >= first).astype(float)) for first in moments]
     if count > 2:
         courses.append((0, True, when / (count - 1)))
     width = recalibration.prior_widths(result, framed) / free.scale
-    tried: list[tuple[float, Drift]] = []
-    causes = recalibration.candidates(free, problem.data)
-    for cause, prior in zip(causes, recalibration.log_priors(causes), strict=True):
-        index = [free.names.index(name) for name in cause.members]
-        scale = float(free.scale[index[0]])
-        for start, steady, course in courses:
-            # parameters that move while readings are taken, by a part of the whole change
-            g, G = misfit.projected(slice(misfit.m), A[:, index] * course[:, None])
-            moved = None
-            if len(g) == 1 and G[0, 0] > 0:
-                change, std = scale * g[0] / G[0, 0], scale / np.sqrt(G[0, 0])
-                moved = recalibration.Moved(cause.name, free.dimensions[index[0]], float(change), float(std))
-            drift = Drift(misfit.evidence(cause, g, G), start, steady, moved)
-            tried.append((prior + recalibration.log_bayes_factor(g, G, width[index]), drift))
-    best = max(tried, key=lambda each: each[0])[1]  # as `update` has it: p-values favour few parameters
+    readings = dict(recalibration.readings(problem, model))
+    causes = [*recalibration.candidates(free, problem.data), *readings]
+    priors = recalibration.log_priors(causes)
+
+    def tried(kept: Array) -> Iterator[tuple[float, Drift]]:
+        """Yield explanations of the equations that are kept (m, 1), with logarithms of their probabilities."""
+        misfit = recalibration.Misfit(result, replace(model, A=model.A * kept, b=model.b * kept[:, 0]), form)
+        for cause, prior in zip(causes, priors, strict=True):
+            if cause in readings:
+                rows = readings[cause]
+                change = misfit.projected(rows, kept[rows] * np.eye(len(rows)))
+                bayes = recalibration.log_bayes_factor(*change, np.full(len(rows), recalibration.OUTLIER_WIDTH))
+                yield prior + bayes, Drift(misfit.evidence(cause, *change), int(when[rows[0]]), False, None)
+                continue
+            index = [free.names.index(name) for name in cause.members]
+            scale = float(free.scale[index[0]])
+            for start, steady, course in courses:
+                # parameters that move while readings are taken, by a part of the whole change
+                g, G = misfit.projected(slice(misfit.m), kept * A[:, index] * course[:, None])
+                moved = None
+                if len(g) == 1 and G[0, 0] > 0:
+                    change, std = scale * g[0] / G[0, 0], scale / np.sqrt(G[0, 0])
+                    moved = recalibration.Moved(cause.name, free.dimensions[index[0]], float(change), float(std))
+                drift = Drift(misfit.evidence(cause, g, G), start, steady, moved)
+                yield prior + recalibration.log_bayes_factor(g, G, width[index]), drift
+
+    kept, wrong = np.ones((len(A), 1)), []
+    while True:
+        found = list(tried(kept))
+        best = max(found, key=lambda each: each[0])[1]  # as `update` has it: p-values favour few parameters
+        if best.cause.p_value * len(found) >= level:
+            return None, tuple(wrong)
+        if best.cause.kind != "reading" or len(wrong) >= recalibration.SPARED * count:
+            break
+        wrong.append(best.cause)
+        kept[readings[best.cause._replace(gain=0.0, p_value=1.0)]] = 0.0
     least = best.cause.gain - recalibration.AS_GOOD
-    others = dict.fromkeys(drift.cause.name for _, drift in tried if drift.cause.gain > least)
-    best = best._replace(others=tuple(name for name in others if name != best.cause.name))
-    return best if best.cause.p_value * len(tried) < level else None
+    others = dict.fromkeys(drift.cause.name for _, drift in found if drift.cause.gain > least)
+    return best._replace(others=tuple(name for name in others if name != best.cause.name)), tuple(wrong)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -242,6 +242,7 @@ def update(
     (['ABB IRB 120-3/0.58'], ())
     """
     say = progress or (lambda step: None)
+    data = by_visit(data)
     problem = with_data(result, data)
     free = problem.parameters.free
     released = _reset(result, data, free, reset)
@@ -500,6 +501,17 @@ def penalty_of(formulation: Formulation, n: int) -> Quadratic:
 # --- the previous result as a prior ------------------------------------------------------------------------
 
 
+def by_visit(data: Dataset, visit: np.ndarray | None = None) -> Dataset:
+    """Return checks with one configuration a visit (N,): a place that is reached again was read and reached anew.
+
+    Without ``visit`` these are runs of equal configurations.
+    """
+    if visit is None:
+        visit = np.cumsum(np.diff(data.configuration, prepend=data.configuration[0]) != 0)
+    keys = [visit, data.configuration, np.unique(data.session, return_inverse=True)[1]]
+    return replace(data, configuration=np.unique(np.stack(keys), axis=1, return_inverse=True)[1].ravel())
+
+
 def with_data(result: Calibration, data: Dataset) -> CalibrationProblem:
     """Return a result's problem with other measurements; new sessions are appended."""
     problem = result.problem
@@ -634,6 +646,16 @@ def candidates(free: Parameters, data: Dataset, reset: Sequence[str] = ()) -> li
     return causes + [Cause(*whole, tuple(names)) for whole, names in wholes.items()]
 
 
+def readings(problem: Source, model: LinearModel) -> Iterator[tuple[Cause, np.ndarray]]:
+    """Yield every configuration as a cause, that was measured wrongly, with its equations."""
+    rows: dict[int, list[str]] = {}
+    for part in problem.rows():
+        for label, configuration in zip(part.data.label, part.data.configuration, strict=True):
+            rows.setdefault(int(configuration), []).append(label)
+    for number, labels in rows.items():
+        yield Cause(labels[0], "reading", tuple(labels)), np.flatnonzero(model.group == number)
+
+
 def _weighed(
     result: Calibration, problem: Source, x: Array, prior: Formulation, released: Sequence[str]
 ) -> tuple[tuple[Cause, ...], Fit]:
@@ -649,14 +671,9 @@ def _weighed(
         change = misfit.projected(slice(misfit.m, None), misfit.L[:, index])
         causes.append(misfit.evidence(cause, *change))
         logs.append(log_bayes_factor(*change, width[index]))
-    rows: dict[int, list[str]] = {}  # a configuration may have been measured wrongly
-    for part in problem.rows():
-        for label, configuration in zip(part.data.label, part.data.configuration, strict=True):
-            rows.setdefault(int(configuration), []).append(label)
-    for number, labels in rows.items():
-        equations = np.flatnonzero(model.group == number)
+    for cause, equations in readings(problem, model):
         change = misfit.projected(equations, np.eye(len(equations)))
-        causes.append(misfit.evidence(Cause(labels[0], "reading", tuple(labels)), *change))
+        causes.append(misfit.evidence(cause, *change))
         logs.append(log_bayes_factor(*change, np.full(len(equations), OUTLIER_WIDTH)))
     posterior = np.array(logs) + log_priors(causes)
     whole = float(np.logaddexp.reduce(posterior, initial=np.log(UNCHANGED)))

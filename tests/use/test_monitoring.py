@@ -74,6 +74,25 @@ def test_a_step_is_found_with_its_moment_and_size() -> None:
     assert abs(drift.moved.change - 5e-4) < 4 * drift.moved.std
 
 
+@pytest.mark.parametrize("moves", [False, True])
+def test_one_wrong_check_of_a_place_is_named_and_no_other(moves: bool) -> None:
+    """Six places are checked four times; one reading is 0.8 mm off, and `update` leaves that one out."""
+    result, data = checked(0, np.full(CHECKS, 1e-3 * moves))
+    (block,) = data.blocks
+    y = block.y.copy()
+    y[14, 0] += 8e-4
+    data = replace(data, blocks=(replace(block, y=y),))
+    updated = ro.use.update(result, data)
+    readings = [cause for cause in updated.changes if cause.kind == "reading"]
+    assert [cause.members for cause in readings] == [(data.label[14],)]
+    assert updated.changed == moves
+    if not moves:
+        found = ro.use.monitor(result, data)
+        assert [cause.members for cause in found.wrong] == [(data.label[14],)]
+        assert (found.drift, found.alarm, found.beyond) == (None, None, (14,))
+        assert str(found).startswith("No drift in 23 of 24 checks.")
+
+
 def test_a_slow_drift_is_no_step() -> None:
     found = ro.use.monitor(*checked(2, np.linspace(0, 1e-3, CHECKS)))
     assert found.drift is not None
