@@ -147,7 +147,7 @@ class LackOfFit:
             lines.append(f"{EXTENSIONS[extension].effect} (likelihood-ratio statistic {gain:.0f}).")
         if self.missing:
             what = joined([EXTENSIONS[extension].name for extension in self.missing])
-            remedy = f': add {joined(self.parameters)} to `identify`, or model = "auto".'
+            remedy = f': model = "auto" includes it; or add {joined(self.parameters)} to `identify`.'
             if self.updated:
                 remedy = f". {TOGETHER}"
             lines.append(

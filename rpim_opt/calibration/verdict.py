@@ -226,7 +226,7 @@ def _little_motion(result: Outcome) -> Iterator[str]:
 
 
 def _stretch(result: Outcome) -> float:
-    """Return the common deviation of a robot's lengths, as by the scale of what measured them; 0 where there is none."""
+    """Return the common deviation of a robot's lengths, as by the scale of what measured them; 0 for none."""
     free, C = result.problem.parameters.free, result.known_covariance
     # of rows that do not fit, and of another robot, deviations say nothing
     if C is None or any(_residuals(result, kept_rows(result))) or any(_deviations(result)):

@@ -20,6 +20,7 @@ from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR
+from rpim_opt.problem.row_functions import masses_assumed
 from rpim_opt.robot.extensions import EXPECTED
 from rpim_opt.robot.parameters import EXPANSION, is_joint_offset, of_session, own_name
 
@@ -168,6 +169,12 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
         )
     if not result.formulation.solvable:
         lines.append("The result file cannot store functions of a script: use that script to calibrate again.")
+    part = result.problem.sample()
+    if any(masses_assumed(arm.robot, arm.parameters, arm.data) for arm in map(part.alone, part.arms)):
+        lines.append(
+            "Gravity acts on assumed masses of the links: state their masses in the robot file (mass_kg, centre_x_mm, "
+            "...) for smaller errors."
+        )
     if result.record.noise_assumed:
         lines.append(
             "The measurement noise is assumed, not stated; uncertainties and verdict depend on it. State the "

@@ -279,7 +279,7 @@ def require_loads(robot: Robot, parameters: Parameters, blocks: Sequence[Block])
 
 
 def require_same_torques(robot: Robot, parameters: Parameters, before: bool, now: bool) -> None:
-    """Refuse other torques than a problem has where compliances need them: gravity's are on guessed masses."""
+    """Refuse other torques than a problem has where compliances need them: gravity's are on assumed masses."""
     if before != now and needed(robot, parameters).torques:
         accepted = (
             "columns tau1_Nm, ... in all data or in none: torques computed from gravity differ from measured ones"
@@ -287,12 +287,17 @@ def require_same_torques(robot: Robot, parameters: Parameters, before: bool, now
         raise InputError("compliances", f"data {'with' if now else 'without'} joint torques", accepted)
 
 
-def require_known_masses(robot: Robot, parameters: Parameters, data: Dataset, payload: Array) -> None:
-    """Refuse payloads [kg] that were not measured, where masses of the links are guessed.
+def masses_assumed(robot: Robot, parameters: Parameters, data: Dataset) -> bool:
+    """Return whether compliances follow from gravity on links whose masses are not stated."""
+    return not robot.gravity.masses and not measured_torques(data) and needed(robot, parameters).torques
 
-    Compliances follow from gravity on the links then, and take up how wrong these masses are: not the payload's.
+
+def require_known_masses(robot: Robot, parameters: Parameters, data: Dataset, payload: Array) -> None:
+    """Refuse payloads [kg] that were not measured, where masses of the links are assumed.
+
+    Compliances take up how wrong these masses are: not the payload's.
     """
-    if robot.gravity.masses or measured_torques(data) or not needed(robot, parameters).torques:
+    if not masses_assumed(robot, parameters, data):
         return
     carried = [robot.gravity.payload if block.payload is None else block.payload for block in data.blocks]
     low, high = min(map(np.min, carried)), max(map(np.max, carried))

@@ -98,15 +98,16 @@ def parameters(result: Calibration, dimension: str = "length", ax: Axes = None) 
     ax = _axes(ax, len(own))
     unit, si = display(dimension)
     x = result.x[own] / si
-    spread = np.zeros(len(own))
+    spread, legend = np.zeros(len(own)), "deviation"
     with suppress(InputError):
         spread = np.nan_to_num(Uncertainty(result).expanded[own] / si, posinf=0.0)
+        legend = "deviation, 95 % interval"
     bound = active_tolerance(result)[own] / si
     bounded = np.isfinite(bound)
     place = np.arange(1.0, len(own) + 1)
     ax.axvline(0, color=COLORS["before"], lw=1)
     ax.hlines(place, x - spread, x + spread, color=COLORS["after"])
-    _dots(ax, x, place, "after", "deviation, 95 % interval")
+    _dots(ax, x, place, "after", legend)
     if bounded.any():
         ends = np.concatenate([-bound[bounded], bound[bounded]])
         at = np.tile(place[bounded], 2)

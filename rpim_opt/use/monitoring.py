@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 import scipy
 from scipy.special import fdtrc, fdtri, ndtr, ndtri
 
-from rpim_opt.basics.arrays import Array, finite_numbers
+from rpim_opt.basics.arrays import Array, finite_numbers, rms
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import joined, listed, three_digits
@@ -31,6 +32,7 @@ SMALLEST = 1e-12  # probabilities are taken as no smaller: 7 standard deviations
 ALLOWANCE = 0.5  # CUSUM's reference value k, taken off every deviate: sums answer fastest to a shift of twice as much
 CELLS = 150  # steps of a sum's range in the Markov chain of its distribution
 HIGHEST_LIMIT = 50.0
+SET_UP_ANEW = 3.0  # factor by which errors are smaller if every set-up is registered again, from which on they moved
 MOTION = 1.0  # standard deviation of a motion that the checks alone tell [m, rad]
 
 
@@ -218,6 +220,12 @@ def monitor(
 
 
 def _moved_or_changed(result: Calibration, data: Dataset) -> str:
+    names = set_ups(result, data)
+    if len(names) > 1:
+        with suppress(InputError):
+            again = registered_again(result, data)[0]
+            if SET_UP_ANEW * rms(result.errors(again)) < rms(result.errors(data)):
+                return f"Likely: the instrument or the base moved between sessions {listed(names)}. Use --register."
     return recalibration.moved_or_changed(result, data, held_out_errors(result, data))[0] if len(data) else ""
 
 

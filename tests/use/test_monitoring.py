@@ -190,6 +190,9 @@ def test_a_change_is_found_where_the_instrument_is_set_up_anew_each_time(checks:
     """One motion was fitted to all set-ups; of a single one it took a part of the change, by ten deviations."""
     result, data = checked(1, np.zeros(checks))
     assert not ro.use.monitor(result, set_up_anew(data), register=True).drifts
+    if checks > PLACES:
+        mistake = ro.use.monitor(result, set_up_anew(data)).mistake
+        assert mistake.endswith("moved between sessions M0, M1, M2, M3. Use --register.")
     result, data = checked(1, np.where(np.arange(checks) >= first, 2e-3, 0.0))
     drift = ro.use.monitor(result, set_up_anew(data), register=True).drift
     assert drift is not None
