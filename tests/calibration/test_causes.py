@@ -271,7 +271,7 @@ def braced(change):
         ("iiwa7", joints(lambda q: q[..., [0, 1, 6, 2, 3, 4, 5]]), "joints in the order q1, q2, q7, q3, q4, q5, q6"),
         ("iiwa7", joints(lambda q: q[..., ::-1]), "joints in the order q7, q6, q5, q4, q3, q2, q1"),
         ("irb120", values(lambda y: stations(y)), "from about row P55 on the points fit another base"),
-        ("irb120", values(lambda y: np.where(SECOND, y[:, [1, 0, 2]], y)), "P2, P4, .* fit if read otherwise: .* mirrored"),
+        ("irb120", values(lambda y: np.where(SECOND, y[:, [1, 0, 2]], y)), "P2, P4, .* fit if read .* mirrored"),
         ("iiwa7", NEARER, "from row P4. on measured distances are -12"),
         ("iiwa7", braced(NEARER), "from row {P4.} on measured distances are -12"),
         ("ur5e", of_joint(0, lambda q: (q + np.pi / 2) % np.pi - np.pi / 2), "wrong values of joint 1"),
