@@ -215,18 +215,23 @@ def monitor(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
         allowed=np.sqrt(equations * fdtri(equations, max(result.noise_dof, 1.0), 1 - level / count)),
         sums=cusum(deviate * right), limit=cusum_limit(count, level), drift=drift, wrong=wrong, registered=motion,
-        mistake=misread(result, data) or _moved_or_changed(result, data.take(np.flatnonzero(right))),
+        mistake=_mistake(result, data, right),
     )  # fmt: skip
 
 
-def _moved_or_changed(result: Calibration, data: Dataset) -> str:
+def _mistake(result: Calibration, data: Dataset, right: np.ndarray) -> str:
+    """Return a likely mistake in checks (N,), or a change of the robot by those that are right; empty for none."""
     names = set_ups(result, data)
     if len(names) > 1:
         with suppress(InputError):
             again = registered_again(result, data)[0]
             if SET_UP_ANEW * rms(result.errors(again)) < rms(result.errors(data)):
                 return f"Likely: the instrument or the base moved between sessions {listed(names)}. Use --register."
-    return recalibration.moved_or_changed(result, data, held_out_errors(result, data))[0] if len(data) else ""
+    found = misread(result, data)
+    data = data.take(np.flatnonzero(right))
+    return found or (
+        recalibration.moved_or_changed(result, data, held_out_errors(result, data))[0] if len(data) else ""
+    )
 
 
 def _framed(problem: CalibrationProblem) -> tuple[CalibrationProblem, list[int], np.ndarray]:
