@@ -37,10 +37,13 @@ PART_OF_PI = re.compile(r"([+-]?)\s*(?:(\d+(?:\.\d*)?)\s*\*?\s*)?(?:π|pi)\s*(?:
 """An angle [rad] as a part of pi, ``-pi/2``."""
 GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 """What may be a whole number with its thousands apart, or one with three decimals."""
+ACCOUNTED = re.compile(r"\(((?:\d{1,3}(?:,\d{3})+|\d+)\.\d+)\)|([\d.,]*\d[.,]\d+)-")
+"""Negative numbers as accounting writes them, ``(1,079.557)`` and ``129.2-``; of brackets and commas alone: a list."""
 BEYOND = {"angle": 20 * math.pi, "length": 50.0}
 """Joint values and coordinates [SI] that no table has: ten turns, and farther than instruments stand."""
-PARTS = re.compile(r"(?=.)(?:(j|a|q|joint_?|axis_?)1(?: \1\d)+)?(?:(?:^| )x y z)?")
-"""What tables with one row per coordinate, joint, or both, name in that row, sorted."""
+AXES = {"x", "y", "z"}
+PARTS = re.compile(r"(j|a|q|joint_?|axis_?)1(?: \1\d)+")
+"""What tables with one row per quantity name in that row: the axes and whatever else, or joints alone, sorted."""
 VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.IGNORECASE)
 """What the column is called that holds the coordinates of a table with one row per coordinate."""
 WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
@@ -178,6 +181,7 @@ def is_missing(cell: str) -> bool:
 
 def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     """Return the table in a file: the rows with most numbers, below the texts directly above them."""
+    grid = _signed(grid)
     counts = [_count(row) for row in grid.rows]
     most = max(counts, default=0)
     if not grid.rows:
@@ -189,8 +193,13 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     heads, above = _heads(grid, numeric, options)
     others = () if len(heads) == len(options.columns) else options.columns  # another file's, without a header
     options = replace(options, columns=() if others else options.columns)
-    begins = {i: "".join(filter(str.isalpha, next(filter(None, grid.rows[i])))) for i in numeric}
-    full = [i for i in numeric if begins[i].lower() not in SUMMARIES]
+    full: list[int] = []
+    last = ""
+    for i in numeric:
+        label = next(filter(None, grid.rows[i]))
+        if not _summarizes(label, last):
+            full.append(i)
+            last = label
     stated = [(row, _stated_units(row)) for row in grid.rows[: above[0] if above else 0]]
     units = next((units for _, units in reversed(stated) if units), {})
     lines_of_units = [f"units above the header: {' '.join(filter(None, row))}." for row, of_row in stated if of_row]
@@ -199,6 +208,23 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     lines_of_units += [f"--columns has {len(others)} names, the header {len(heads)}: it is used."] * bool(others)
     notes = (*grid.notes, *_notes(grid, above, left, options), *lines_of_units, *table.notes)
     return replace(table, notes=notes, units=units, left=[grid.rows[i] for i in sorted(left)])
+
+
+def _signed(grid: Grid) -> Grid:
+    """Return a grid with the signs of accounting before its numbers, unless other numbers have them there."""
+    cells = [cell for row in grid.rows for cell in row]
+    example = next(filter(ACCOUNTED.fullmatch, cells), "")
+    if not example or any(re.match(r"-[.,]?\d", cell) for cell in cells):
+        return grid
+    rows = [[ACCOUNTED.sub(r"-\1\2", cell) if ACCOUNTED.fullmatch(cell) else cell for cell in row] for row in grid.rows]
+    return grid._replace(rows=rows, notes=(*grid.notes, f"numbers such as '{example}' are negative, as in accounting."))
+
+
+def _summarizes(label: str, before: str) -> bool:
+    """Return whether a row is no measurement: ``Mean``, or ``Mean P1`` after a row whose name begins with P1."""
+    word, _, rest = label.partition(" ")
+    text = word if before.startswith(rest) else label
+    return "".join(filter(str.isalpha, text)).lower() in SUMMARIES
 
 
 def _stated_units(row: Sequence[str]) -> dict[str, str]:
@@ -479,11 +505,12 @@ def _parts(stem: str, count: int) -> Sequence[str]:
 
 def _one_row_each(table: RawTable) -> RawTable:
     """Return a table whose rows hold a coordinate, ``P1, X, 1.5``, or a joint and one per point; others as is."""
-    axis, parts = _axis(table.columns)
+    texts = {name: [str(cell).strip() for cell in cells] for name, cells in table.columns.items()}
+    axis = next(filter(lambda name: _are_parts(texts[name]), texts), "")
     if not axis:
         return table
-    texts = {name: [str(cell).strip() for cell in cells] for name, cells in table.columns.items()}
-    letters = [cell.lower() for cell in texts.pop(axis)]
+    letters = texts.pop(axis)
+    parts = sorted({*letters})
     texts = {name: _without_letters(cells, letters) for name, cells in texts.items()}
     points = next(filter(None, (_points(cells, letters) for cells in texts.values())), [])
     if not points:
@@ -502,13 +529,10 @@ def _one_row_each(table: RawTable) -> RawTable:
     return replace(table, columns=columns, notes=(*table.notes, note))
 
 
-def _axis(columns: Mapping[str, Sequence[Any]]) -> tuple[str, list[str]]:
-    """Return the column whose cells name x, y, z or the joints of several points alone, and these names; or none."""
-    for name, cells in columns.items():
-        parts = sorted({str(cell).strip().lower() for cell in cells})
-        if len(parts) < len(cells) and PARTS.fullmatch(" ".join(parts)):
-            return name, parts
-    return "", []
+def _are_parts(cells: Sequence[str]) -> bool:
+    """Return whether cells name the axes, or joints alone, of several points."""
+    parts = {cell.lower() for cell in cells}
+    return len(parts) < len(cells) and (parts >= AXES or PARTS.fullmatch(" ".join(sorted(parts))) is not None)
 
 
 def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:

@@ -164,6 +164,20 @@ def sexagesimal(angle: str) -> str:
     return f"{'-' * (float(angle) < 0)}{tenths // 36000}°{tenths // 600 % 60:02d}'{tenths % 600 / 10:04.1f}\""
 
 
+def accounted(number: str, before: str, after: str) -> str:
+    size = f"{abs(float(number)):,.4f}"
+    return f"{before}{size}{after}" if float(number) < 0 else size
+
+
+QUANTITIES = [
+    [label, *quantity]
+    for label, q, p in zip(LABELS, JOINTS, POINTS, strict=True)
+    for quantity in [
+        *((f"A{j}", value, "deg") for j, value in enumerate(q, 1)),
+        *((axis, value, "mm") for axis, value in zip("XYZ", p, strict=True)),
+        ("Room", "20.5", "degC"),
+    ]
+]
 MEANS = ["Média", *(f"{v:.3f}" for v in [*Q.mean(axis=0), *P.mean(axis=0)])]
 ARRAYS = {
     "cell": 4,
@@ -179,6 +193,9 @@ FORTRAN = [[f"{float(v) / 1e3:.9f}D+03" for v in row[1:]] for row in ROWS]
 
 
 FRESH: dict[str, Shape] = {
+    "signs as in accounting": one(text([HEAD], beside(NAMED, *([[accounted(v, *signs) for v in row] for row in part] for part, signs in ((JOINTS, ("", "-")), (POINTS, ("(", ")"))))), "\t"), "raw.txt"),
+    "a row a quantity, with others than joints and axes": one(text([["point", "quantity", "value", "unit"]], QUANTITIES, ";")),
+    "means and deviations below their points": one(text([HEAD], [[f"{what}{row[0]}", *row[1:-1], f"{float(row[-1]) + off}"] for row in ROWS for what, off in (("", 0), ("Mean ", 1), ("Std ", 2))])),
     "Chinese in GB18030": encoded(["点号", *joint_names("关节{}(°)"), "实测X(mm)", "实测Y(mm)", "实测Z(mm)"], "gb18030"),
     "Russian in Windows-1251": encoded(["Точка", *joint_names("Ось {}, град"), "X, мм", "Y, мм", "Z, мм"], "cp1251", comma=True),
     "a mean in another language below": one(text([["Ponto", *HEAD[1:]]], [*ROWS, MEANS])),
