@@ -35,7 +35,7 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
     ready = robots()
     if name in ready:
         return READY / f"{name}.toml"
-    accepted = "a file .toml, .urdf, .json, .yaml (Universal Robots' kinematics), or a DH table .csv, .md, .xlsx, ..."
+    accepted = "a file .toml, .urdf, .json, .yaml (Universal Robots' kinematics), or a DH table .csv, .md, .m, ..."
     file = None if folder is None else folder / "problem.toml"
     if name.endswith(".xacro"):
         accepted = "a URDF, which ROS's command makes of it (xacro arm.urdf.xacro > arm.urdf)"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -172,15 +173,63 @@ def test_an_index_of_the_link_before_says_that_it_is_modified(tmp_path: Path, he
             "i,theta_i,a_i [mm],d_i [mm],alpha_i [deg]\n1,q1,25,400,-90\n2,q2,455,0,0\n3,q3-90,35,0,-90\n"
             "4,q4,0,420,90\n5,q5,0,0,-90\n6,q6,0,80,0\n",
         ),
+        (
+            "toolbox.m",
+            "% KR 6 R900, L(7) = Link([0 1 1 0])\nL(1) = Link([0 0.4 0.025 -pi/2]);\n"
+            "L(2) = Link([0, 0, 0.455, 0, 0]);\n"
+            "L(3) = Link('a', 0.035, 'offset', -pi/2, 'alpha', -90*pi/180, ...\n  'qlim', [-pi pi]);\n"
+            'L(4) = Link([0 0.42 0 pi/2], "standard");\nL(5) = Revolute(\'alpha\', -pi/2);\n'
+            "L(6) = Link('revolute', 'd', 0.08);\nrobot = SerialLink(L, 'name', 'KR 6');\n",
+        ),
     ],
-    ids=["a joint a column", "Markdown, parts of pi", "a box of lines", "a unit above the header", "names of angles"],
-)
+    ids=["a joint a column", "Markdown, parts of pi", "a box of lines", "a unit above the header", "names of angles",
+         "a script for the Robotics Toolbox"],
+)  # fmt: skip
 def test_a_sheet_as_people_write_it_is_the_robot(tmp_path: Path, name: str, content: str) -> None:
     (tmp_path / name).write_text(content, encoding="utf-8")
     arm = read_arm(tmp_path / name, convention="standard")
     expected = np.array([[0, 0, 0, 0.4, 0], [-90, 0.025, 0, 0, 0], [0, 0.455, -90, 0, 0], [-90, 0.035, 0, 0.42, 0],
                          [90, 0, 0, 0, 0], [-90, 0, 0, 0.08, 0]])  # fmt: skip
     assert np.abs(arm.robot.mdh - expected * [np.pi / 180, 1, np.pi / 180, 1, 1]).max() < 1e-12
+
+
+MODIFIED = (
+    "L(1) = RevoluteMDH('d', 0.3);\nL(2) = Link('theta', pi/2, 'a', 0.3, 'alpha', pi, 'offset', 0.1, 'modified');\n"
+    "L(3) = Link([0 9 0 0 1 0.2], 'modified');\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("scara.m", MODIFIED),
+        ("scara.csv", "type,theta [deg],d [m],a [m],alpha [deg],convention\nR,0,0.3,0,0,Craig\n"
+         "LIN,90,0.1,0.3,180,Craig\n"
+         "T,0,0.2,0,0,Craig\n"),
+    ],
+)  # fmt: skip
+def test_joints_that_slide_are_called_so_in_many_words(tmp_path: Path, name: str, content: str) -> None:
+    (tmp_path / name).write_text(content, encoding="utf-8")
+    robot = read_arm(tmp_path / name).robot
+    expected = [[0, 0, 0, 0.3, 0], [np.pi, 0.3, np.pi / 2, 0.1, 0], [0, 0, 0, 0.2, 0]]
+    assert robot.joint_types == ("revolute", "prismatic", "prismatic")
+    np.testing.assert_allclose(robot.mdh, expected, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("L(i) = Link(DH(i,:));", "a link: found 'DH(i,:)', accepted: numbers"),
+        ("L(1) = Link('theta', 1, 'd', 2);", "a link: found"),
+        ("robot = SerialLink(dh);", "no link of the Robotics Toolbox"),
+        ("L(1) = Link([0 d1 0 0]);", "'d1'"),
+        (MODIFIED + "L(4) = Link([0 0 0 0]);", "modified and standard"),
+    ],
+)
+def test_a_script_without_numbers_is_refused(tmp_path: Path, script: str, said: str) -> None:
+    (tmp_path / "robot.m").write_text(script)
+    with pytest.raises(ro.InputError, match=re.escape(said)):
+        read_arm(tmp_path / "robot.m")
 
 
 @pytest.mark.parametrize(

@@ -271,7 +271,9 @@ def test_joints_and_points_need_a_key(monkeypatch, capsys, tmp_path, arm) -> Non
     )
     points.write_text(text([["Point", *HEAD[7:]]], [[f"Q{i}", *row] for i, row in enumerate(POINTS)]))
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points]) == 2
-    assert "no common value in first.csv (P1, P2, P3 and 33 more) and second.csv (Q0, Q1, Q2" in capsys.readouterr().err
+    assert (
+        "no common values in first.csv (P1, P2, P3 and 33 more) and second.csv (Q0, Q1, Q2" in capsys.readouterr().err
+    )
     points.write_text(text([["Point", *HEAD[7:]]], [[f"P{i}", *row] for i, row in enumerate(POINTS)]))
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points], "--dry-run") == 0
     said = capsys.readouterr().out
@@ -563,6 +565,24 @@ def test_clocks_that_do_not_agree_are_one_sentence(monkeypatch, capsys, tmp_path
     files[1].write_text(files[1].read_text().replace("Timestamp [ms]", "Remark"))
     assert new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.01") == 2
     assert "no column of times among" in capsys.readouterr().err
+
+
+def test_few_equal_times_are_asked_for_a_tolerance(monkeypatch, capsys, tmp_path, arm) -> None:
+    files = clocked(tmp_path, rate=100.0, apart=0.0)
+    rows = [
+        [name[0], f"{i + 0.05 + 0.003 * (i > 3):.4f}", *p]
+        for i, (name, p) in enumerate(zip(NAMED, POINTS, strict=True))
+    ]
+    files[1].write_text(text([["Point", "time [s]", *HEAD[7:]]], rows))
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--hold-out", "0.25") == 2
+    error = capsys.readouterr().err.strip()
+    assert "\n" not in error
+    assert "the key column 'time [s]': found 4 common values in" in error
+    assert "accepted: --time-tolerance SECONDS for the nearest time, or --key 'time [s]' for equal ones alone" in error
+    assert new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.004") == 0
+    assert f"{COUNT} rows match" in capsys.readouterr().out
+    assert new(monkeypatch, arm, tmp_path / "two", files, "--key", "time [s]") == 0
+    assert "4 rows match" in capsys.readouterr().out
 
 
 def test_each_of_the_fewer_has_its_own_partner() -> None:

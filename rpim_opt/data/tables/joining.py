@@ -145,7 +145,7 @@ def _in_units_of(first: CanonicalTable, table: CanonicalTable) -> dict[str, Sequ
 
 
 def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
-    """Return the rows of equal keys; where none are equal and all times nearly are, of the nearest times."""
+    """Return the rows of equal keys; where none or few times are equal and all nearly are, of the nearest times."""
     chosen = _key(joints, values, key)
     count = len(chosen.left)
     if sorted([chosen.left, chosen.right]) == [[str(i) for i in range(k, k + count)] for k in (0, 1)]:
@@ -155,15 +155,22 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
     if len(place) < SAME * len(chosen.left):
         raise InputError(f"the key {chosen.how}", f"'{next(iter(again))}' twice in {joints.file}", "unique keys")
     right = [i for i, name in enumerate(chosen.right) if name in place]
-    if not right:
+    times = not key and all(time_column([name]) for name in chosen.columns or [""])
+    few = len(right) < SAME * min(len(place), len(chosen.right))
+    if not right or (times and few):
         if not key and all(time_column(side.raw) is not None and len(side.labels) > 1 for side in (joints, values)):
             there, then = (_times(side, "")[1] for side in (joints, values))
             within = SIMULTANEOUS * float(min(np.diff(np.sort(there)).min(), np.diff(np.sort(then)).min()))
             if within and len(partners(there, then, within)[1]) == len(then):
                 return _by_time(joints, values, key, within)
         names = [f"{side.file} ({listed(keys, 3)})" for side, keys in ((joints, chosen.left), (values, chosen.right))]
-        found = f"no common value in {' and '.join(names)}"
-        raise InputError(f"the key {chosen.how}", found, f"--key with a column of common values, {OTHER_KEYS}")
+        found = f"{len(right) or 'no'} common values in {' and '.join(names)}"
+        accepted = f"--key with a column of common values, {OTHER_KEYS}"
+        if times:
+            accepted = (
+                f"--time-tolerance SECONDS for the nearest time, or --key '{chosen.columns[0]}' for equal ones alone"
+            )
+        raise InputError(f"the key {chosen.how}", found, accepted)
     right.sort(key=lambda i: place[chosen.right[i]])
     names = [chosen.right[i] for i in right]
     counts = f"{len(right)} rows match, of {len(chosen.left)} with joints and {len(chosen.right)} measured"

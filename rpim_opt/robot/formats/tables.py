@@ -22,11 +22,12 @@ from rpim_opt.basics.schema import Angle, Length, Mass, Misfit, Table, validate
 from rpim_opt.basics.tables import csv_text, is_numeral
 from rpim_opt.basics.units import DISPLAY, UNITS, accepted_units, display, split
 from rpim_opt.robot.chain import Chain, RobotSetup, describe, joint_values, standard_table, without_beta
+from rpim_opt.robot.formats.robotics_toolbox import read_links
 from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
 READY = Path(__file__).resolve().parents[1] / "ready"
-SHEETS = (".csv", ".tsv", ".txt", ".md", ".xlsx")  # endings of tables with one row per joint
+SHEETS = (".csv", ".tsv", ".txt", ".md", ".xlsx", ".m")  # endings of tables with one row per joint
 WRITTEN = (".toml", ".json", ".csv")  # endings of what is written
 LIMITS = ("lower", "upper")
 CENTRE = ("centre_x", "centre_y", "centre_z")
@@ -42,8 +43,13 @@ INDEX = re.compile(r"(?:[_\s(\[{]+i|ⱼ)[)\]}]*(?=\s|$)")
 """Of the joint itself, ``d(i)``, ``theta_i``: common to all conventions."""
 SHEET = {"\u03b1": "alpha", "\u237a": "alpha", "θ": "theta", "β": "beta", "twist": "alpha", "theta offset": "theta",
          "offset": "theta", "r": "a", "min": "lower", "minimum": "lower", "max": "upper", "maximum": "upper",
-         "q\u207b": "lower", "q\u207a": "upper"}  # fmt: skip
+         "q\u207b": "lower", "q\u207a": "upper", "sigma": "type", "\u03c3": "type", "joint type": "type"}  # fmt: skip
 """Other names of columns, those that the Robotics Toolbox prints among them."""
+TYPES = {
+    **dict.fromkeys(("r", "rot", "rotary", "rotational", "continuous", "0"), "revolute"),
+    **dict.fromkeys(("p", "t", "lin", "linear", "trans", "translational", "1"), "prismatic"),
+}
+"""Other words for a joint's type, 0 and 1 the sigma of the Robotics Toolbox."""
 RANGE = re.compile(r"[\s_]*(?:range|limits?|bereich|grenzen?)[\s_]*")
 """Beside the word of a limit, ``range min``, ``lower limit``; alone a column of both."""
 BOTH_LIMITS = re.compile(
@@ -222,7 +228,10 @@ def read_sheet(path: Path, convention: str = "", units: Mapping[str, str] = Mapp
         modified   Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)
         standard   Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta)
     """
-    raw = read_table(path, turned=lambda grid: {"alpha", "a", "d"} <= {_stem(row[0])[0] for row in grid.rows})
+    if path.suffix.lower() == ".m":
+        raw = read_links(path)
+    else:
+        raw = read_table(path, turned=lambda grid: {"alpha", "a", "d"} <= {_stem(row[0])[0] for row in grid.rows})
     for row in raw.left:  # a remark below the table has few cells, and no numbers alone
         cells = [cell for cell in row if cell]
         if len(cells) > len(raw.columns) / 2 or any(map(is_numeral, cells)) or JOINT_NAME.fullmatch(cells[0]):
@@ -311,6 +320,8 @@ def _joint(cells: dict[str, str]) -> dict[str, Any]:
     joint: dict[str, Any] = {}
     for name, text in cells.items():
         if text and name != "note":
+            if name == "type":
+                text = TYPES.get(text.lower(), text.lower())
             joint[name] = text
             if name.startswith("theta"):
                 text = ANGLE_OF.sub(r"\1", text).replace(" ", "") or "0"

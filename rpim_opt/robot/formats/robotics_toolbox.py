@@ -1,0 +1,45 @@
+"""Links of a script for the Robotics Toolbox for MATLAB, as a DH table in rad and m; base and tool are left out.
+
+``L(1) = Link([theta d a alpha sigma offset], 'modified')``, ``Link('d', 0.4, 'a', 0.025, 'alpha', -pi/2)``,
+``Revolute(...)``, ``PrismaticMDH(...)``: what is not called modified is in the standard convention. The joint's own
+variable is not read: where it begins is the offset.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.layout import RawTable
+from rpim_opt.basics.tables import decoded
+
+LINK = re.compile(r"\b(Link|Revolute|Prismatic)(MDH)?\s*\(((?:[^()]|\([^()]*\))*)\)")
+NAMED = re.compile(r"'(\w+)'\s*,\s*([^\s,'][^,']*)")
+ORDER = ("theta", "d", "a", "alpha", "sigma", "offset")
+HEADERS = {"theta": "theta [rad]", "d": "d [m]", "a": "a [m]", "alpha": "alpha [rad]", "sigma": "type",
+           "convention": "convention"}  # fmt: skip
+
+
+def read_links(path: Path) -> RawTable:
+    """Return the table of a script's links, in their order."""
+    text = re.sub(r"\.\.\.[^\n]*\n|%[^\n]*", "", decoded(path)[0]).replace('"', "'")
+    columns: dict[str, list[str]] = {header: [] for header in HEADERS.values()}
+    for kind, craig, inside in LINK.findall(text):
+        vector = re.match(r"\s*\[([^\]]*)\]", inside)
+        stated = dict(NAMED.findall(inside))
+        if vector:
+            stated = dict(zip(ORDER, re.split(r"[\s,]+", vector[1].strip()), strict=False))
+        if stated.keys().isdisjoint(ORDER) or (not vector and {"theta", "d"} <= stated.keys()):
+            accepted = "numbers, Link([0 0.4 0.025 -pi/2]), or names: theta of a joint that slides, d of one that turns"
+            raise InputError("a link", f"'{inside.strip()[:40]}'", accepted)
+        slides = kind == "Prismatic" or "'prismatic'" in inside or (not vector and "theta" in stated)
+        values = {**dict.fromkeys(ORDER, "0"), "sigma": f"{slides:d}", **stated}
+        values["theta" if values["sigma"].strip() == "0" else "d"] = values["offset"]
+        values["convention"] = "modified" if craig or "'modified'" in inside else "standard"
+        for name, header in HEADERS.items():
+            columns[header].append(values[name].strip())
+    if not columns["convention"]:
+        accepted = "L(1) = Link([theta d a alpha], 'modified'), ..."
+        raise InputError("the file", "no link of the Robotics Toolbox", accepted)
+    return RawTable(columns)
