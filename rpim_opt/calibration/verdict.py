@@ -416,9 +416,10 @@ def _deviations(result: Outcome, named: bool = False) -> Iterator[str]:
     i = int(size.argmax())
     if size[i] > 1:
         unit, largest = MACHINED[kinds[i]]
-        said = f"{p.free.names[i]} deviates by {three_digits(1e3 * result.x[i])} {unit}"
+        alike = [k for k in np.argsort(-size) if size[k] > 1 and MACHINED[kinds[k]] == MACHINED[kinds[i]]]
+        amounts = [f"{p.free.names[k]} deviates by {three_digits(1e3 * result.x[k])} {unit}" for k in alike]
         cause = "" if named else _cause(result, i, largest)
-        yield f"{said}: manufacturing errors stay below {1e3 * largest:g} {unit}. {cause}".rstrip()
+        yield f"{listed(amounts, 3)}: manufacturing errors stay below {1e3 * largest:g} {unit}. {cause}".rstrip()
 
 
 def _cause(result: Outcome, i: int, largest: float) -> str:
@@ -428,6 +429,11 @@ def _cause(result: Outcome, i: int, largest: float) -> str:
     C = result.known_covariance
     if not penalized and C is not None and C[i, i] > largest**2:
         return "Neither the data nor a penalty determine it: add a penalty on it, or do not identify it."
+    if not any(_residuals(result, kept_rows(result))):
+        return (
+            "The data fit with it: check the robot file, whether it is of this model, and for misprints (of a standard "
+            "DH table a and alpha are in the row before)."
+        )
     return "Check the order, signs and units of the joint columns, and the DH table."
 
 
@@ -533,7 +539,8 @@ def likely_causes(result: Outcome) -> list[str]:
     signs = [*_large_residuals(result, residuals), *_large_deviations(result)]
     head = [f"{BAD}: {'; '.join(signs)}."] if signs else []
     ordered = in_table_order(problem, result.excluded, result.record.validation)
-    shared = [*shared_rows(problem.data, result.record.validation), *copied_rows(problem.data)]
+    shared = list(shared_rows(problem.data, result.record.validation))
+    copied = list(copied_rows(problem.data))
     together = list(left_out_together(problem.labels, {row.label for row in result.left_out}))
     if result.mapping is not None:
         shared += result.mapping.ambiguities
@@ -564,8 +571,8 @@ def likely_causes(result: Outcome) -> list[str]:
         shared += remarks
     if noticed:
         causes += _upward(result, problem)
-    if causes or shared:
-        return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
+    if causes or shared or copied:
+        return [*head, *copied, *(f"Likely: {cause}" for cause in causes), *shared]
     return [*head, NOTHING] if max(ratio for _, ratio in residuals.values()) > HOPELESS else []
 
 

@@ -889,7 +889,8 @@ def test_a_size_of_the_points_is_no_cause_where_wrong_lengths_explain_them(monke
     wrong = mistakes.dh_table(lambda mdh: mdh + longer)(simulated_arm("irb120"))
     result = ro.calibrate(wrong, ro.tikhonov, 1e-4)
     (text,) = result.verdict.reasons
-    assert "manufacturing errors stay below 30 mm. Check the order, signs and units of the joint columns" in text
+    assert re.match("d4 deviates by -140 mm, a3 deviates by -90.. mm: manufacturing errors stay below 30 mm. ", text)
+    assert "The data fit with it: check the robot file" in text
     assert result.errors().max() < 3e-4
 
 
@@ -1330,3 +1331,27 @@ def test_a_ready_robot_next_to_the_right_one_is_not_delivered() -> None:
     assert not result.verdict.delivered
     assert 'write robot = "ur10e"' in str(result.verdict)
     assert ro.calibrate(ro.problem_from("ur10e", data)).verdict.delivered
+
+
+def test_joint_values_of_another_time_on_the_way_are_named() -> None:
+    """An arm is measured while it moves, with clocks 0.13 of a row apart: straight ways between rows are too far."""
+    problem = ro.load("position").problem
+    time = np.arange(40.0)
+
+    def way(t: np.ndarray) -> np.ndarray:
+        return np.sin(np.outer(t, [0.31, 0.23, 0.41, 0.37, 0.29, 0.47]) + np.arange(6.0))
+
+    moved = problem.on(ro.Dataset.of(way(time - 0.13), np.zeros((40, 3)), 5e-5))
+    y = moved.modelled(np.zeros(len(moved.parameters.free)))[0] + 5e-5 * np.random.default_rng(0).normal(size=(40, 3))
+    result = ro.calibrate(problem.on(ro.Dataset.of(way(time), y, 5e-5)))
+    assert not result.verdict.delivered
+    assert any("with joint values of 0.13 rows earlier (clocks apart)" in text for text in result.verdict.reasons)
+
+
+def test_points_that_were_pasted_twice_are_named_before_what_they_look_like() -> None:
+    problem = simulated_arm("irb120")
+    (block,) = problem.data.blocks
+    half = len(block.y) // 2
+    twice = replace(block, y=np.concatenate([block.y[:half], block.y[: len(block.y) - half]]))
+    causes = ro.calibration.likely_causes(ro.calibrate(problem.on(replace(problem.data, blocks=(twice,)))))
+    assert re.match(r"\d+ of \d+ rows have measured values of others to the last digit", causes[1])

@@ -9,6 +9,7 @@ from itertools import combinations, permutations, product
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtr
 
@@ -17,6 +18,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, three_digits
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.pose import from_elevation, from_zenith
+from rpim_opt.problem.causes.rows import FEWEST
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import proper, transforms
@@ -398,6 +400,26 @@ def _of_rows(points: Points) -> Iterator[Misreading]:
         yield Misreading(what, how, lambda points, order=order: replace(points, q=points.q[order]))
 
 
+def _apart(points: Points) -> Iterator[Misreading]:
+    """Yield the reading with joint values of another time, on a cubic spline through the rows: clocks are apart."""
+    place = np.arange(len(points.row))
+    if len(place) < 2 * FEWEST:
+        return
+    path = CubicSpline(place, points.q)
+
+    def at(shift: float, points: Points) -> Points:
+        return replace(points, q=path(place + shift))
+
+    shift = 0.0
+    for step in (0.1, 0.02, 0.004):
+        near = (shift + step * np.arange(-9, 10)).tolist()
+        shift = near[int(np.argmin(misfits([at(each, points) for each in near])))]
+    what = f"joint values of {abs(shift):.2g} rows {'earlier' if shift < 0 else 'later'} (clocks apart)"
+    yield Misreading(
+        what, "correct the offset of the two clocks before joining, or measure at rest", partial(at, shift)
+    )
+
+
 def _factors(points: Points) -> Iterator[Misreading]:
     """Yield readings with a column, all angles or all lengths times a factor that fits: other units, counts, gears."""
     robot = points.robot
@@ -502,7 +524,7 @@ def better_interpretation(problem: CalibrationProblem, whole: bool = True) -> Be
     if not np.isfinite(present):
         return None
     chain, left = _mistakes(points, present)
-    for further in ((_factors, _other_robots), (_orders,)):
+    for further in ((_factors, _apart, _other_robots), (_orders,)):
         if left >= BETTER * present and present > WRONG and not points.by_camera and whole:
             first = [each for readings in further for each in readings(points)]
             chain, left = _chain(points, present, first, BETTER * present, 2)

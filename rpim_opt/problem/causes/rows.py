@@ -167,7 +167,7 @@ def shared_rows(data: Dataset, validation: Dataset | None) -> Iterator[str]:
 
 
 def copied_rows(data: Dataset) -> Iterator[str]:
-    """Report rows that duplicate others in joint and measured values, and so are not measurements."""
+    """Report rows that duplicate others in joint and measured values, or points in measured values alone."""
     for block in data.blocks:
         if not block.measurement.columns or len(block.row) < FEWEST:
             continue
@@ -179,6 +179,14 @@ def copied_rows(data: Dataset) -> Iterator[str]:
             yield (
                 f"{copies} of {len(rows)} rows repeat others to the last digit (first {named}): copies are not "
                 "measurements and make uncertainties too small; remove them."
+            )
+        points, count = np.unique(block.y, axis=0, return_inverse=True, return_counts=True)[1:]
+        copies = len(first) - len(count)  # of rows that differ in joint values
+        if block.y.shape[1] >= 3 and copies >= COPIES * len(rows):
+            named = listed([data.label[row] for row in block.row[count[points.ravel()] > 1]], 3)
+            yield (
+                f"{copies} of {len(rows)} rows have measured values of others to the last digit ({named}): were points "
+                "pasted twice? Measure them again, or leave them out ([exclude])."
             )
 
 
