@@ -417,7 +417,7 @@ def _deviations(result: Outcome, named: bool = False) -> Iterator[str]:
     if size[i] > 1:
         unit, largest = MACHINED[kinds[i]]
         alike = [k for k in np.argsort(-size) if size[k] > 1 and MACHINED[kinds[k]] == MACHINED[kinds[i]]]
-        amounts = [f"{p.free.names[k]} deviates by {three_digits(1e3 * result.x[k])} {unit}" for k in alike]
+        amounts = [f"{p.free.names[k]} deviates by {three_digits(1e3 * float(result.x[k]))} {unit}" for k in alike]
         cause = "" if named else _cause(result, i, largest)
         yield f"{listed(amounts, 3)}: manufacturing errors stay below {1e3 * largest:g} {unit}. {cause}".rstrip()
 

@@ -146,12 +146,14 @@ def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None
 
 def conclusion(result: Calibration, found: Workspace | None) -> tuple[str, str]:
     """Return the verdict on a robot without an acceptance limit, and it as a sentence; empty if it is not delivered."""
+    if not result.verdict.delivered:
+        return "rejected", ""
     if doubt := inconclusive(result, found):
         return "inconclusive", doubt
     text = "Delivered: the fit gives no reason against using this robot; no acceptance limit is stated."
     if result.verdict.caution:
         text = "Delivered under a condition: check the condition below before using this robot."
-    return "accepted", text * result.verdict.delivered
+    return "accepted", text
 
 
 def identifiability(result: Calibration) -> str:

@@ -563,6 +563,7 @@ def test_inspect_and_calibrate_name_the_same_causes_in_one_order(monkeypatch, ca
     causes = [[text for text in texts if text.startswith(("Likely: ", "Signs or zeros"))] for texts in found]
     assert causes[0] == causes[1]
     assert before["delivered"] == after["verdict"]["delivered"] == (code == 0)
+    assert (after["conclusion"] == "accepted") == (code == 0)
 
 
 @pytest.mark.usefixtures("undrawn")
