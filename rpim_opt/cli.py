@@ -93,8 +93,8 @@ USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickE
 INTERRUPTED = 130
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _version(shown: bool) -> None:
+    if shown:
         typer.echo(f"rpim-opt {ro.__version__}")
         raise typer.Exit
 

@@ -69,7 +69,7 @@ def admitted(
     models = Models(bare, estimator, deviation, skip=(SECOND,))
     used = np.isin(models.names, p.free.names)
     before = named(fit.problem, fit.point.v)
-    evidence_with = partial(_given, models.columns, used, np.array([before[name] for name in models.names[used]]))
+    evidence_with = partial(_with_curves, models.columns, used, np.array([before[name] for name in models.names[used]]))
     start = np.log([max(getattr(fit.laid.repeatability, kind), LEAST) for kind in models.columns.noise])
     plain = evidence_with(np.zeros((len(models.columns.data.y), 0))).optima([start], ACCURACY)[0]
     likeliest = _most_likely(evidence_with, models, plain)
@@ -101,7 +101,9 @@ def admitted(
     return joint, (*with_curves, *trials), gain
 
 
-def _given(evidence: Evidence, keep: np.ndarray, v: Array, columns: Array, curves: Sequence[Curve] = ()) -> Evidence:
+def _with_curves(
+    evidence: Evidence, keep: np.ndarray, v: Array, columns: Array, curves: Sequence[Curve] = ()
+) -> Evidence:
     """Return the likelihood of curves and noise, beside some of the deviations (p,) at local variances (k,)."""
     prior = evidence.prior.of(keep)
     width = np.sqrt(np.where(prior.replaced, 1.0, v))
@@ -120,7 +122,7 @@ def _given(evidence: Evidence, keep: np.ndarray, v: Array, columns: Array, curve
 
 
 def _most_likely(
-    given: Callable[[Array, Sequence[Curve]], Evidence], models: Models, plain: Point
+    evidence_with: Callable[[Array, Sequence[Curve]], Evidence], models: Models, plain: Point
 ) -> tuple[Point, tuple[Curve, ...], Array] | None:
     """Return the optimum of curves and noise, the curves and columns (m, c); None where they gain too little."""
     problem = models.whole
@@ -135,7 +137,7 @@ def _most_likely(
     counts = np.maximum(cycles * turns, 1).astype(int)
     curves = tuple(Curve(j + 1, float(centre[j]), float(2 * np.pi * turns[j]), int(counts[j])) for j in joints)
     columns = series(curves, q, slopes)
-    beside = given(columns, curves)
+    beside = evidence_with(columns, curves)
     starts = [beside.at(np.array([beside.centre[0], np.log(length), *plain.logs])) for length in STARTS]
     point = beside.optima([min(starts, key=lambda point: point.value)], ACCURACY)[0]
     if plain.value - point.value <= GAIN or np.exp(point.logs[1]) > np.max(travel[joints]):

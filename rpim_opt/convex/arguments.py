@@ -65,11 +65,11 @@ class Deviations:
 class Arguments(Identified):
     """The identified parameters as the argument of a constraint function, with z (n,) and quantities affine in it.
 
-    Other arguments as for `Parameters`; ``asked`` notes that positions were used, which are linear about some point.
+    Other arguments as for `Parameters`; ``nonlinear`` notes positions that were used, which are linear about a point.
     """
 
     z: Any = None
-    asked: list[str] = field(default_factory=list)
+    nonlinear: list[str] = field(default_factory=list)
 
     @property
     def x(self) -> Deviations:
@@ -115,7 +115,7 @@ def problem_of(p: Arguments) -> CalibrationProblem:
     if p.problem is None:
         found = "parameters without a problem"
         raise InputError("positions", found, "parameters of a problem's linear model (`CalibrationProblem`)")
-    p.asked.append("positions")
+    p.nonlinear.append("positions")
     return p.problem
 
 

@@ -66,9 +66,9 @@ class Ready:
             if isinstance(argument, list):
                 raise InputError(self.maker, f"{argument}", f"arguments one by one: {self.maker}(*{argument})")
 
-    def __call__(self, *given: Any) -> Any:
+    def __call__(self, *values: Any) -> Any:
         """Return what the function does."""
-        return self.function(*given, *self.arguments)
+        return self.function(*values, *self.arguments)
 
     @property
     def stated(self) -> list[Any]:

@@ -112,7 +112,7 @@ class Expressions:
         self.own = {variable.id for variable in frozen.own}
         self.stated: tuple[Any, ...] = (self.loss.expression, self.penalty_of_z, self.constraints)
         self.live: tuple[Any, ...] = (live_loss, live_penalty, live)
-        self.predicts = bool(known.asked)
+        self.predicts = bool(known.nonlinear)
 
     def owned(self, *stated: Any) -> set[int]:
         """Return the ids of the functions' own variables in some expressions and constraints."""

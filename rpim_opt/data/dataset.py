@@ -368,10 +368,10 @@ def _names(names: Sequence[Any] | np.ndarray, what: str, N: int, points: int = 1
         raise InputError(what, f"{len(names)} names", f"{N}, one per row")
     if not len(names):
         return None
-    given = np.array(names, dtype=object)
-    if given.shape not in ((N,), (N, points)):
-        raise InputError(what, f"shape {given.shape}", f"{N} names, one per row" + (points > 1) * " or point")
-    return given.astype(str).astype(object)
+    array = np.array(names, dtype=object)
+    if array.shape not in ((N,), (N, points)):
+        raise InputError(what, f"shape {array.shape}", f"{N} names, one per row" + (points > 1) * " or point")
+    return array.astype(str).astype(object)
 
 
 def _beside(values: ArrayLike | None, what: str, like: np.ndarray) -> Any:

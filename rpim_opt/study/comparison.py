@@ -97,7 +97,7 @@ def compare(
     >>> len(found.to_frame()), found.metric
     (8, 'rms_mm')
     """
-    asked = problems_of(problems)
+    by_label = problems_of(problems)
     compared = methods_of(formulations, selectors, methods, options or {})
     ways = splits_of(splits)
     numbers_drawn = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1)
@@ -113,12 +113,14 @@ def compare(
         )
 
     def work(case: Mapping[str, Any]) -> studies.Work:  # which takes no more along than it needs
-        return partial(replicate, asked[case["problem"]], ways[case["split"]], compared[case["method"]], figured, case)
+        return partial(
+            replicate, by_label[case["problem"]], ways[case["split"]], compared[case["method"]], figured, case
+        )
 
     made = studies.provenance()
-    drawn = {label for label, problem in asked.items() if not isinstance(problem, Instance)}
+    drawn = {label for label, problem in by_label.items() if not isinstance(problem, Instance)}
     cases: list[studies.Row] = []
-    for (label, problem), (split, size), count in product(asked.items(), ways.items(), numbers_drawn):
+    for (label, problem), (split, size), count in product(by_label.items(), ways.items(), numbers_drawn):
         every = np.inf if callable(problem) else len(np.unique(problem.problem.data.configuration))
         # what a seed changes: what is generated or held out, which configurations are drawn
         seeded = callable(problem) or size > 0 or (count is not None and count < every)
@@ -130,14 +132,14 @@ def compare(
     code: dict[str, str] = {}
     if path is not None:
         own = {name: metric for name, metric in figured.items() if METRICS.get(name) is not metric}
-        inputs = {"problems given": asked, "methods": compared, "metrics": (tuple(figured), own)}
+        inputs = {"problems given": by_label, "methods": compared, "metrics": (tuple(figured), own)}
         hashes = {f"set of {name}": studies.content_hash(value, "journal") for name, value in inputs.items()}
         code = studies.package_code() | studies.script_code() | hashes
         path.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar("comparing", progress) as say:
         rows = studies.run_cases(cases, work, workers, say, path, code, resume)
     axes = {
-        "Problems": asked,
+        "Problems": by_label,
         "Methods": compared,
         "Held out": ways,
         "Configurations": [str(count or "all") for count in numbers_drawn],
@@ -165,7 +167,7 @@ class Comparison:
     ``rows`` are plain tables: ``problem``, ``method``, ``formulation``, ``selector``, ``split``, ``fold``, ``count``
     (as stated), ``seed``; ``status`` (``ok``, ``not delivered``, ``impossible``, ``failed``) with
     its ``reason``; ``configurations`` and ``parameters`` that were fitted, the ``weight``, and the ``metrics``.
-    ``drawn`` are problems that depend on the seed, ``asked`` the grid as text, ``made`` script, package, versions
+    ``drawn`` are problems that depend on the seed, ``grid`` the grid as text, ``made`` script, package, versions
     and time.
 
     >>> import rpim_opt as ro
@@ -181,7 +183,7 @@ class Comparison:
     rows: tuple[studies.Row, ...]
     metrics: tuple[str, ...]
     drawn: frozenset[str] = frozenset()
-    asked: Mapping[str, str] = field(default_factory=dict)
+    grid: Mapping[str, str] = field(default_factory=dict)
     made: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -260,7 +262,7 @@ class Comparison:
             *summary.notes,
             f"Median {summary.metric} by problem:",
             markdown(["method", *self.problems], medians),
-            *(f"{name}: {what}" for name, what in self.asked.items()),
+            *(f"{name}: {what}" for name, what in self.grid.items()),
         ])  # fmt: skip
         replicates = csv_text(self.rows[0], (row.values() for row in self.rows))
         ratios = {each.method: each.ratio for each in summary.standings if each.ratio is not None}

@@ -107,13 +107,13 @@ def _problems(stated: Any, label: str = "") -> Iterator[tuple[str, Problem]]:
         raise InputError("problems", f"a {type(stated).__name__}", ACCEPTED)
 
 
-def _instance(given: Any, label: str) -> Instance | None:
+def _instance(candidate: Any, label: str) -> Instance | None:
     """Return a problem in one of its forms as an instance; None for anything else."""
-    match given:
+    match candidate:
         case Instance():
-            return given
+            return candidate
         case CalibrationProblem():
-            return Instance(given, tikhonov, None, record=Record(label))
+            return Instance(candidate, tikhonov, None, record=Record(label))
         case (CalibrationProblem() as problem, Dataset() as validation, *_):  # a simulated arm, too
             return Instance(problem, tikhonov, None, record=Record(label, validation=validation))
     return None

@@ -393,21 +393,21 @@ def tool_uncertainty(result: Calibration, q: Array, tool: Array | None, marker: 
 
 def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
     """Return the targets as labelled arrays; InputError for what does not fit."""
-    given = {name: rows for name, rows in stated._asdict().items() if rows is not None and name != "label"}
-    if not given.keys() & {"q", "poses"}:
+    arrays = {name: rows for name, rows in stated._asdict().items() if rows is not None and name != "label"}
+    if not arrays.keys() & {"q", "poses"}:
         raise InputError("targets", "neither joint values nor poses", "q, poses, or both")
-    N = len(np.atleast_1d(given.get("poses", stated.q)))
+    N = len(np.atleast_1d(arrays.get("poses", stated.q)))
     count = max(N, 1)
     shapes = {"q": [(count, robot.dof)], "torque": [(count, robot.dof)], "poses": [(count, 7), (count, 3)]}
-    given = {name: finite_numbers(name, rows, *shapes[name]) for name, rows in given.items()}
-    if "poses" in given and given["poses"].shape[1] == 7:
+    arrays = {name: finite_numbers(name, rows, *shapes[name]) for name, rows in arrays.items()}
+    if "poses" in arrays and arrays["poses"].shape[1] == 7:
         try:
-            given["poses"] = pose.prepare(given["poses"])[:, : 7 if orientation else 3]
+            arrays["poses"] = pose.prepare(arrays["poses"])[:, : 7 if orientation else 3]
         except RowError as error:
             raise InputError(f"poses, {error.where}", error.found, error.accepted) from None
     if len(stated.label) not in (0, N):
         raise InputError("label", f"{len(stated.label)} labels", f"{N}, one per row")
-    return stated._replace(label=stated.label or tuple(str(i) for i in range(1, N + 1)), **given)
+    return stated._replace(label=stated.label or tuple(str(i) for i in range(1, N + 1)), **arrays)
 
 
 # --- the controller's robot beside the identified one ------------------------------------------------------
@@ -540,8 +540,8 @@ class _Cell:
             there = load[first], wanted[first], commands[first], limits[:, first], counts[first] * FIRST, still[None]
             corrected[first], left[first], active[first] = nearest(self.identified, *there)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        met = is_reached(left * np.where(turning, 1.0, KEPT[:k]), counts)
-        cases = {"ok": met, "limited": at_limit, UNREACHABLE: ~reached}
+        reached_all = is_reached(left * np.where(turning, 1.0, KEPT[:k]), counts)
+        cases = {"ok": reached_all, "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status, "there": pose_before[:, :3]}
         fields["position_before"], fields["orientation_before"] = norms(before)

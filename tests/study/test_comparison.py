@@ -286,7 +286,7 @@ def test_a_journal_knows_the_package_that_computed(tmp_path: Path, monkeypatch: 
 def test_names_with_commas_are_told_apart_and_a_method_that_answers_no_numbers_is_named() -> None:
     methods = {"short": lambda problem: [0.0], "blind": lambda problem: [np.nan] * len(problem.parameters.free)}
     found = ro.compare("position", ["tikhonov"], ["reml", 1.0], methods=methods, progress=False)
-    assert found.asked["Methods"] == "tikhonov, reml; tikhonov, 1; short; blind"
+    assert found.grid["Methods"] == "tikhonov, reml; tikhonov, 1; short; blind"
     notes = "\n".join(found.summary().notes)
     assert "Method short: found shape (1,), accepted: 34 finite deviations" in notes
     assert "Method blind: found nan" in notes

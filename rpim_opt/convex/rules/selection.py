@@ -82,13 +82,13 @@ def on_inliers(rule: Callable[..., Selection]) -> Callable[..., Selection]:
     """Apply a rule to the equivalent linear estimator of a robust fit, repeated until its choice stays."""
 
     @wraps(rule)
-    def chosen(program: Program, *given: Any, **options: Any) -> Selection:
+    def chosen(program: Program, *arguments: Any, **options: Any) -> Selection:
         if not program.separable or program.formulation.penalty is None:
-            return rule(program, *given, **options)
+            return rule(program, *arguments, **options)
         weight, rounds = 1.0, 0
         while True:
             z = program.solve(weight).z
-            selection = rule(program.on_squares(program.inlier_model(z)), *given, **options)
+            selection = rule(program.on_squares(program.inlier_model(z)), *arguments, **options)
             rounds += 1
             if abs(np.log(max(selection.weight, SMALLEST) / weight)) < SETTLED or rounds == ROUNDS:
                 return selection

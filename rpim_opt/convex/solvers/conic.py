@@ -396,15 +396,15 @@ class ReducedProgram:
             slack, dual = b - A @ x, np.zeros(len(b))
             dual[working - p.zero] = multipliers[p.zero :]
             rounding = 1e-9 * max(weight * np.abs(p.q).max(initial=0.0), np.abs(dual).max(initial=0.0))
-            met = slack >= -1e-11 * (1 + np.abs(b))
-            if met.all() and (dual >= -rounding).all():
+            holds = slack >= -1e-11 * (1 + np.abs(b))
+            if holds.all() and (dual >= -rounding).all():
                 self.working, self.near = working, x
                 every = np.zeros(len(p.b))
                 every[active] = multipliers
                 return Point(x, every)
             tight = np.zeros(len(b), dtype=bool)
             tight[working - p.zero] = True
-            changed = np.flatnonzero(tight != np.where(tight, (dual > 0) | ~met, slack < 0))
+            changed = np.flatnonzero(tight != np.where(tight, (dual > 0) | ~holds, slack < 0))
             tight[changed[: 1 if cycles else None]] ^= True
             working = p.zero + np.flatnonzero(tight)
         return None

@@ -270,8 +270,8 @@ def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any
     accepted = {name: (dimension,) for name, dimension in {**kind.noise, **kind.components}.items()}
     for (stem, _), value in quantities(plain, accepted, "table noise").items():
         if not value >= SMALLEST:
-            asked = f"a standard deviation > 0, from {SMALLEST:g} on"
-            raise InputError(f"table noise, key {stem}", f"{value:g}", asked)
+            accepted = f"a standard deviation > 0, from {SMALLEST:g} on"
+            raise InputError(f"table noise, key {stem}", f"{value:g}", accepted)
         declared[stem] = value
     return declared
 

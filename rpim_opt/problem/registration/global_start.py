@@ -348,12 +348,12 @@ def _plainer(
 
 @dataclass(frozen=True, eq=False)
 class _Mappings:
-    """Mappings that explain points: signs (B, dof) and fits, those from ``given`` on added by `_plainer`."""
+    """Mappings that explain points: signs (B, dof) and fits, those from ``sampled`` on added by `_plainer`."""
 
     points: Points
     sign: Array
     fits: Fit
-    given: int
+    sampled: int
 
     @cached_property
     def zeros(self) -> list[Array]:
@@ -387,7 +387,7 @@ class _Mappings:
 
         def alike(i: int, k: int) -> bool:
             turns = np.abs(np.angle(np.exp(1j * (self.zeros[k] - self.zeros[i]))))
-            near = max(i, k) >= self.given and (turns < NEAR_ZERO).all() and (self.sign[k] == self.sign[i]).all()
+            near = max(i, k) >= self.sampled and (turns < NEAR_ZERO).all() and (self.sign[k] == self.sign[i]).all()
             return bool(near) or _apart(there[i], there[k], self.points.lengths) <= same
 
         links = [[alike(i, k) for k in there] for i in there]
@@ -433,12 +433,12 @@ def _judged(
     if not least <= ACCEPTED * points.extent or (small and EXPLAINED * least >= left[0]):
         return None
     near, inliers = _likely(points, fits)
-    given = len(sign)
+    sampled = len(sign)
     if problem is not None and not points.by_camera:
         plainer, more = _plainer(points, problem, sign[near], Fit(*(each[near] for each in fits)), inliers)
-        near += range(given, given + len(plainer))
+        near += range(sampled, sampled + len(plainer))
         sign, fits = np.vstack([sign, plainer]), stacked([fits, more])
-    found = _Mappings(points, sign, fits, given)
+    found = _Mappings(points, sign, fits, sampled)
     # within the joint limits, and wherever joints were measured
     measured = points.q.reshape(-1, points.robot.dof)
     low, high = measured.min(axis=0), measured.max(axis=0)
@@ -455,7 +455,7 @@ def _judged(
         return points.lengths and _apart(-there[one[0]], there[other[0]], True) <= same
 
     # robots that a plainer mapping describes, and mirror images, are as good as the best
-    as_good = [i for i, each in plainest.items() if each is best or mirrors(each, best) or max(each) >= given]
+    as_good = [i for i, each in plainest.items() if each is best or mirrors(each, best) or max(each) >= sampled]
     i = min(as_good, key=found.plain)
     first = plainest.pop(i)
     changes = found.plain(i)[0]
