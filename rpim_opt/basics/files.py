@@ -148,7 +148,7 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
     or pipe gets the bytes as they are.
     """
     streams = [path for path in contents if path.exists() and not (path.is_file() or path.is_dir())]
-    with writing(*contents), undoing() as folders, ExitStack() as stack, undoing() as renames:
+    with writing(*contents), ExitStack() as stack, _undoing() as renames:
         made: dict[Path, Path] = {}
         for path in contents:
             if path in streams:
@@ -156,7 +156,7 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
             place = Path(os.path.realpath(path))
             if place.is_dir():
                 raise IsADirectoryError(21, "it is a folder", str(place))
-            make_folder(place.parent, folders)
+            place.parent.mkdir(parents=True, exist_ok=True)
             made[place] = Path(stack.enter_context(scratch_folder(place)), "file")
             with made[place].open("xb") as stream:
                 _keep_mode(stream.fileno(), place)
@@ -179,25 +179,11 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
 
 
 @contextmanager
-def undoing() -> Iterator[ExitStack]:
+def _undoing() -> Iterator[ExitStack]:
     """Collect undo steps, which run in reverse order only if the body of the ``with`` statement fails."""
     with ExitStack() as steps:
         yield steps
         steps.pop_all()
-
-
-def make_folder(folder: Path, steps: ExitStack) -> None:
-    """Make a folder and its parents; the undo steps remove them while they are empty."""
-    for each in reversed([folder, *folder.parents]):
-        if not each.is_dir():
-            with suppress(FileExistsError):  # somebody else just made it
-                each.mkdir()
-                steps.callback(_remove_empty, each)
-
-
-def _remove_empty(folder: Path) -> None:
-    with suppress(OSError):
-        folder.rmdir()
 
 
 def _keep_mode(handle: int, place: Path) -> None:

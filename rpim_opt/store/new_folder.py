@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -244,9 +243,9 @@ def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
 
 def _write_whole(folder: Path, contents: Mapping[str, bytes], arm: RobotSetup, source: Path, chains: bool) -> None:
     """Write a new folder with its robot beside its place, and move it there when it is whole."""
-    with ExitStack() as stack:
-        files.make_folder(folder.parent, stack.enter_context(files.undoing()))
-        made = Path(stack.enter_context(files.scratch_folder(folder)), folder.name)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with files.scratch_folder(folder) as scratch:
+        made = Path(scratch, folder.name)
         files.write_files({made / name: content for name, content in contents.items()})
         if chains:
             files.write_files({made / ROBOT_OF_CHAINS: files.read_bytes(source)})
