@@ -38,7 +38,6 @@ SMALLEST = 1e-12  # correction [rad or m] below which nothing is corrected
 BLOCK = 8192  # rows that are worked on together, so that what they need stays in the processor's cache
 REACHED = 1e-7  # A target counts as reached when no more than this is left [m, rad]
 EXPANDED = 2.0  # coverage factor of the expanded uncertainty that is compared with errors and the limit
-LESS_KNOWN = 3.0  # ratio of the stated tool's uncertainty to the reflector's above which the reason is reported
 BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
 FIRST = np.array([1, 1, 1, 1e-3, 1e-3, 1e-3])  # weights [m/rad] of an error with which the position comes first
@@ -337,17 +336,6 @@ def compensate(
         if outside.rows:
             beyond = listed([targets.label[i] for i in outside.rows])
             point += f" No solution in the measured joint ranges was found for {beyond}."
-    if tool is not None:
-        reflector = _Cell(result, robot, arm, kind, None, cell.marker, base, targets.torque is not None)
-        row = int(np.argmax(whole["std"]))
-        known = reflector.uncertainty(whole["q"][[row]], targets.take([row]))[0][0]
-        if whole["std"][row] > LESS_KNOWN * known:
-            at_tool, at_reflector = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (whole["std"][row], known))
-            point += (
-                f" In row {targets.label[row]}, U (k = 2) is {at_tool} at the tool, {at_reflector} at the reflector. "
-                "Measure a reflector as far from the flange as this point, and state what is known of the flange "
-                "(`known` in [prior]), which the data do not separate from the tool."
-            )
     return Compensation(
         result.problem.arms[robot], targets.label, **whole, outside=outside, note=" ".join(filter(None, notes)),
         point=point, limit=limit, source=result.record.identity,
@@ -455,7 +443,11 @@ class _Cell:
             self.point += "; for the controller's TCP state --tool."
         else:
             place = finite_numbers("tool", tool, (6,))
-            self.point = f"Target point: the stated tool, at {placed(place)} in the flange frame."
+            self.point = (
+                f"Target point: the stated tool, at {placed(place)} in the flange frame. Its U contains what the data "
+                "do not tell of the flange: to lower it, measure a reflector as far from the flange, or state what is "
+                "known of that (`known` in [prior])."
+            )
         p = replace(p, nominal=p.nominal.copy(), identified=p.identified.copy())
         p.nominal[at], x[at] = place, 0.0
         p.identified[at] &= tool is None

@@ -664,18 +664,15 @@ def _weighed(
     model = problem.linearize(x)
     misfit = Misfit(result, model, penalty_of(prior, len(x)), [free.names.index(name) for name in released])
     width = prior_widths(result, problem) / free.scale
-    causes: list[Cause] = []
-    logs: list[float] = []
+    tried: list[tuple[Cause, tuple[Array, Array], Array]] = []  # with its change, and the widths of that
     for cause in candidates(free, problem.data, released):
         index = [free.names.index(name) for name in cause.members]
-        change = misfit.projected(slice(misfit.m, None), misfit.L[:, index])
-        causes.append(misfit.evidence(cause, *change))
-        logs.append(log_bayes_factor(*change, width[index]))
+        tried.append((cause, misfit.projected(slice(misfit.m, None), misfit.L[:, index]), width[index]))
     for cause, equations in readings(problem, model):
-        change = misfit.projected(equations, np.eye(len(equations)))
-        causes.append(misfit.evidence(cause, *change))
-        logs.append(log_bayes_factor(*change, np.full(len(equations), OUTLIER_WIDTH)))
-    posterior = np.array(logs) + log_priors(causes)
+        values = np.eye(len(equations))
+        tried.append((cause, misfit.projected(equations, values), np.full(len(equations), OUTLIER_WIDTH)))
+    causes = [misfit.evidence(cause, *change) for cause, change, _ in tried]
+    posterior = log_priors(causes) + [log_bayes_factor(*change, widths) for _, change, widths in tried]
     whole = float(np.logaddexp.reduce(posterior, initial=np.log(UNCHANGED)))
     order = np.argsort(-posterior)
     weighed = [causes[i]._replace(probability=float(np.exp(posterior[i] - whole))) for i in order]
