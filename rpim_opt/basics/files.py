@@ -148,7 +148,7 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
     or pipe gets the bytes as they are.
     """
     streams = [path for path in contents if path.exists() and not (path.is_file() or path.is_dir())]
-    with writing(*contents), ExitStack() as stack, _undoing() as renames:
+    with writing(*contents), ExitStack() as stack, ExitStack() as renames:
         made: dict[Path, Path] = {}
         for path in contents:
             if path in streams:
@@ -176,14 +176,7 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
                 renames.callback(old.replace, place) if known else renames.callback(place.unlink)
         for path in streams:
             path.write_bytes(contents[path])
-
-
-@contextmanager
-def _undoing() -> Iterator[ExitStack]:
-    """Collect undo steps, which run in reverse order only if the body of the ``with`` statement fails."""
-    with ExitStack() as steps:
-        yield steps
-        steps.pop_all()
+        renames.pop_all()  # nothing has to be taken back
 
 
 def _keep_mode(handle: int, place: Path) -> None:

@@ -332,8 +332,6 @@ def overlay(
     What names fewer parameters goes before. ``where`` and ``file`` are named in errors; ``signed``: whether zero and
     negative values are accepted.
     """
-    if not table:
-        return values.copy()
     members: dict[str, list[int]] = {}  # whom keys may mean: groups, joint offsets, patterns of the table, names
     for i, group in enumerate(parameters.groups):
         members.setdefault(group, []).append(i)
