@@ -519,7 +519,11 @@ def _one_row_each(table: RawTable) -> RawTable:
     # of columns with one text for all rows of a point, that one
     every = {name: [{cells[i] for i in rows.values()} for rows in points] for name, cells in texts.items()}
     columns = {name: [min(own) for own in each] for name, each in every.items() if max(map(len, each)) == 1}
-    value = _value_column({name: cells for name, cells in texts.items() if name not in columns})
+    numeric = [name for name, cells in texts.items() if name not in columns and _is_numeric(cells)]
+    value, *others = [name for name in numeric if VALUE.search(name)] or numeric or ["none"]
+    if others or not numeric:
+        found = f"one row per coordinate, value columns: {', '.join([value, *others])}"
+        raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
     units = [cells for cells in texts.values() if {cell.lower() for cell in cells} <= UNIT_SIGNS]
     for part in parts:
         of_part = {cells[i] for cells in units for i, letter in enumerate(letters) if letter == part}
@@ -540,16 +544,6 @@ def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:
     pairs = zip(cells, letters, strict=True)
     named = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell, re.IGNORECASE) for cell, letter in pairs]
     return [match[1] for match in named if match] if all(named) else cells
-
-
-def _value_column(columns: Mapping[str, Sequence[str]]) -> str:
-    """Return the only column of numbers, or the only one of these whose name states it."""
-    numeric = [name for name, cells in columns.items() if _is_numeric(cells)]
-    measured = [name for name in numeric if VALUE.search(name)] or numeric
-    if len(measured) != 1:
-        found = f"one row per coordinate, value columns: {', '.join(measured) or 'none'}"
-        raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
-    return measured[0]
 
 
 def _points(names: Sequence[str], letters: Sequence[str]) -> list[dict[str, int]]:

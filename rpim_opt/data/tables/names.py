@@ -14,7 +14,6 @@ from itertools import islice, product
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import Columns, numbers
@@ -224,22 +223,3 @@ def quaternion_columns(read: Meanings, dof: int) -> list[str]:
             if prefix != "q" or counted or ({"x", "y", "z"} <= others and not joints):  # these are in another file
                 return [columns[i] for i in sorted(columns)]
     return []
-
-
-def quaternions(angles: np.ndarray, rotation: str) -> dict[str, list[str]]:
-    """Return ``qw, qx, qy, qz`` of columns rx, ry, rz (N, 3) [rad], none for rows that are not finite.
-
-    Of ``intrinsic zyx`` the turn about z is first, and the column rz has it; of ``intrinsic zyz`` the columns have the
-    first, second and third turn.
-    """
-    finite = np.isfinite(angles).all(axis=1)
-    rotations = scipy.spatial.transform.Rotation
-    if rotation == "vector":
-        turned = rotations.from_rotvec(angles[finite])
-    else:
-        how, order = rotation.split()
-        places = ["xyz".index(axis) for axis in order] if len(set(order)) == 3 else [0, 1, 2]
-        turned = rotations.from_euler(order.upper() if how == "intrinsic" else order, angles[finite][:, places])
-    cells = np.full((len(angles), 4), "", dtype=object)
-    cells[finite] = np.array([list(map(repr, row)) for row in turned.as_quat().tolist()], dtype=object).reshape(-1, 4)
-    return {f"q{part}": list(cells[:, "xyzw".index(part)]) for part in "wxyz"}

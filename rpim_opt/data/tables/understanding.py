@@ -10,6 +10,7 @@ from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.layout import RawTable, TableOptions, is_missing
@@ -167,7 +168,11 @@ def _readings_below_each_other(raw: RawTable) -> RawTable:
 
 
 def _as_quaternions(columns: Columns, meant: Sequence[Column], rotation: str) -> tuple[Columns, list[Column]]:
-    """Return columns and meanings with a quaternion in the place of three turns."""
+    """Return columns and meanings with a quaternion in the place of three turns.
+
+    Of ``intrinsic zyx`` the turn about z is first, and the column rz has it; of ``intrinsic zyz`` the columns have the
+    first, second and third turn.
+    """
     names = {split_unit(name)[0]: name for name in columns}
     if names.keys().isdisjoint(TURNED):  # a file of joint values, beside one of poses
         return columns, list(meant)
@@ -175,11 +180,23 @@ def _as_quaternions(columns: Columns, meant: Sequence[Column], rotation: str) ->
         raise InputError("the header", "no columns rx, ry, rz", "three of them, or no --rotation")
     turned = [names[turn] for turn in TURNED]
     angles = [(split_unit(name)[1] or UNITS["rad"]).si * _values(columns[name], name) for name in turned]
+    finite = np.flatnonzero(np.isfinite(angles).all(axis=0))
+    rotations = scipy.spatial.transform.Rotation
+    if rotation == "vector":
+        of_rows = rotations.from_rotvec(np.transpose(angles)[finite])
+    else:
+        how, order = rotation.split()
+        places = ["xyz".index(axis) for axis in order] if len(set(order)) == 3 else [0, 1, 2]
+        order = order.upper() if how == "intrinsic" else order
+        of_rows = rotations.from_euler(order, np.transpose(angles)[finite][:, places])
+    xyzw = np.full((len(angles[0]), 4), np.nan)
+    xyzw[finite] = of_rows.as_quat()
+    quaternion = {f"q{part}": xyzw[:, "xyzw".index(part)].tolist() for part in "wxyz"}
     others = {name: cells for name, cells in columns.items() if name not in turned}
     meaning_of_turn = "rotation vector" if rotation == "vector" else f"turn, {rotation}"
     new = {"meaning": meaning_of_turn, "name": "qw, qx, qy, qz", "unit": ""}
     meant = [each._replace(**new) if each.name in turned else each for each in meant]
-    return others | known_names.quaternions(np.column_stack(angles), rotation), meant
+    return others | quaternion, meant
 
 
 # --- what every column holds ---------------------------------------------------------------------------------------

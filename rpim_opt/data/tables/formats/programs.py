@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import scipy
@@ -26,7 +27,7 @@ ABB_JOINTS = re.compile(r"(?:jointtarget\s+(\w+)\s*:=|MoveAbsJ)\s*\[\s*\[([^\]]*
 ABB_POSES = re.compile(r"(?:robtarget\s+(\w+)\s*:=|Move[JL])\s*\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]", re.IGNORECASE)
 UR = re.compile(rf"(?:(\w+)\s*=|move[jlp]\s*\()\s*(p?)\[\s*((?:{NUMBER}\s*,\s*){{5}}{NUMBER})\s*\]", re.IGNORECASE)
 YASKAWA = re.compile(r"^[ \t]*([BCP]+\d+)[ \t]*=[ \t]*([-+\d.][-+\d., \t]*)$", re.MULTILINE)
-KAWASAKI = re.compile(r"^\.JOINTS[^\n]*\n(.*?)^\.END", re.MULTILINE | re.DOTALL | re.IGNORECASE)
+KAWASAKI = re.compile(r"^[ \t]*#(\w+)[ \t]+([-+\d.][-+\d.eE \t]*)$", re.MULTILINE)
 MITSUBISHI = re.compile(r"^[ \t]*(J\w*)[ \t]*=[ \t]*\(([-+\d.][-+\d., \t]*)\)", re.MULTILINE | re.IGNORECASE)
 STAUBLI = re.compile(r"<(Data|Value)\s([^<>]{0,2000})>")
 PLACE = [f"commanded {axis} [mm]" for axis in "xyz"]
@@ -43,8 +44,8 @@ def _rows(targets: Sequence[Target]) -> Rows:
 
 
 def _listed(name: str, cells: str, headers: Sequence[str] = ()) -> Target:
-    """Return a target whose values are separated by commas, by default those of joints [deg]."""
-    values = [cell.strip() for cell in cells.split(",")]
+    """Return a target whose values are separated by commas or blanks, by default those of joints [deg]."""
+    values = re.split(r"\s*,\s*|\s+", cells.strip())
     return name, dict(zip(headers or [f"J{i} [deg]" for i in range(1, len(values) + 1)], values, strict=False))
 
 
@@ -55,6 +56,11 @@ def _paired(name: str, fields: str) -> Target:
         header = part.upper() if part[1:] else f"commanded {part.upper()}"
         values[f"{header} [{unit or ('mm' if part in 'xyzXYZ' else 'deg')}]"] = value
     return name, values
+
+
+def read_joints(pattern: re.Pattern[str], text: str) -> Rows:
+    """Return the points of joint values, each as a pattern of its name and its values has them."""
+    return _rows([_listed(name, cells) for name, cells in pattern.findall(text)])
 
 
 def read_fanuc(text: str) -> Rows:
@@ -104,12 +110,6 @@ def read_yaskawa(text: str) -> Rows:
     return _rows([_listed(name, cells, headers) for name, cells in points])
 
 
-def read_kawasaki(text: str) -> Rows:
-    """Return the points of joint values of an AS program or of what a controller saved."""
-    lines = [line.split() for section in KAWASAKI.findall(text) for line in section.splitlines()]
-    return _rows([_listed(words[0].removeprefix("#"), ",".join(words[1:])) for words in lines if len(words) > 1])
-
-
 def read_staubli(text: str) -> Rows:
     """Return the points by their keys, numbered from 0 without keys; of several arrays as ``array[key]``."""
     array, i = "", 0
@@ -128,18 +128,13 @@ def read_staubli(text: str) -> Rows:
     return [{**row, "label": key} for row, (_, _, key) in zip(rows, parts, strict=True)]
 
 
-def read_mitsubishi(text: str) -> Rows:
-    """Return the points of joint values."""
-    return _rows([_listed(name, cells) for name, cells in MITSUBISHI.findall(text)])
-
-
 FORMATS = (
     TableFormat("FANUC program", (".ls",), read_fanuc),
     TableFormat("KUKA data list", (".dat", ".src"), read_kuka),
     TableFormat("RAPID module", (".mod", ".modx", ".prg", ".sys"), read_abb),
     TableFormat("URScript", (".script", ".urscript"), read_urscript),
     TableFormat("Yaskawa job", (".jbi",), read_yaskawa),
-    TableFormat("Kawasaki AS program", (".as", ".pg"), read_kawasaki),
-    TableFormat("MELFA program", (".prg", ".mb4", ".mb5", ".mb6"), read_mitsubishi),
+    TableFormat("Kawasaki AS program", (".as", ".pg"), partial(read_joints, KAWASAKI)),
+    TableFormat("MELFA program", (".prg", ".mb4", ".mb5", ".mb6"), partial(read_joints, MITSUBISHI)),
     TableFormat("VAL3 data", (".dtx",), read_staubli),
 )
