@@ -505,10 +505,10 @@ def _parts(stem: str, count: int) -> Sequence[str]:
 
 def _one_row_each(table: RawTable) -> RawTable:
     """Return a table whose rows hold a coordinate, ``P1, X, 1.5``, or a joint and one per point; others as is."""
-    texts = {name: [str(cell).strip() for cell in cells] for name, cells in table.columns.items()}
-    axis = next(filter(lambda name: _are_parts(texts[name]), texts), "")
+    axis = next((name for name, cells in table.columns.items() if _are_parts(cells)), "")
     if not axis:
         return table
+    texts = {name: [str(cell).strip() for cell in cells] for name, cells in table.columns.items()}
     letters = texts.pop(axis)
     parts = sorted({*letters})
     texts = {name: _without_letters(cells, letters) for name, cells in texts.items()}
@@ -533,16 +533,16 @@ def _one_row_each(table: RawTable) -> RawTable:
     return replace(table, columns=columns, notes=(*table.notes, note))
 
 
-def _are_parts(cells: Sequence[str]) -> bool:
+def _are_parts(cells: Sequence[Any]) -> bool:
     """Return whether cells name the axes, or joints alone, of several points."""
-    parts = {cell.lower() for cell in cells}
+    parts = {str(cell).strip().lower() for cell in cells}
     return len(parts) < len(cells) and (parts >= AXES or PARTS.fullmatch(" ".join(sorted(parts))) is not None)
 
 
 def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:
     """Return the names of points where every cell names the coordinate besides, ``P1.X``; others as they are."""
     pairs = zip(cells, letters, strict=True)
-    named = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell, re.IGNORECASE) for cell, letter in pairs]
+    named = [re.fullmatch(rf"(.+?)[\s._:-]+{re.escape(letter)}", cell, re.IGNORECASE) for cell, letter in pairs]
     return [match[1] for match in named if match] if all(named) else cells
 
 

@@ -195,7 +195,12 @@ def _key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Key:
     common = [name for name in joints.raw if name in values.raw]
     common = [name for name in common if name == key.lower() or not COUNTER.fullmatch(name)]
     stated = key.lower() or (None if telling and pair else _only(common))
-    chosen = _labels(joints, values, bool(telling)) if key in ("", "label") else None
+    labels = _normal(joints.columns.get("label", ()))
+    chosen = None
+    if key in ("", "label") and not (telling and counts_rows(labels)):  # numbers of rows, where others match
+        sides = (_normal(values.columns.get(column, ())) for column in ("label", "configuration"))
+        keys = (_keyed("label", (), labels, side) for side in sides)
+        chosen = next((each for each in keys if {*labels} & {*each.right}), None)
     if not chosen and stated in common:
         chosen = _keyed(f"column '{stated}'", (stated,), _normal(joints.raw[stated]), _normal(values.raw[stated]))
     if not chosen and not pairs:  # names that differ, with the same numbers
@@ -213,16 +218,6 @@ def _key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Key:
 def _only(items: Sequence[Any]) -> Any:
     """Return the only one; None where there is none, or several."""
     return items[0] if len(items) == 1 else None
-
-
-def _labels(joints: CanonicalTable, values: CanonicalTable, others_tell: bool) -> Key | None:
-    """Return the labels that rows with joints and measured ones share, unless they are row numbers and others match."""
-    labels = _normal(joints.columns.get("label", ()))
-    if others_tell and counts_rows(labels):
-        return None
-    sides = (_normal(values.columns.get(column, ())) for column in ("label", "configuration"))
-    keys = (_keyed("label", (), labels, side) for side in sides)
-    return next((each for each in keys if {*labels} & {*each.right}), None)
 
 
 def _pairs(joints: CanonicalTable, values: CanonicalTable, key: str, numbers: bool = False) -> list[Key]:
