@@ -219,11 +219,6 @@ def ending(ended: Ended, most: int) -> str:
     if not ended.settled:
         what = "the positions predicted in the constraints still change: loosen them, or use a larger weight"
         return f"Not converged: after {ROUNDS} linearizations {what}."
-    if ended.converged and ended.rounds > 1:
-        return (
-            f"Converged after {iterations}; positions in the constraints were linearized {ended.rounds} times, "
-            "at last at the solution."
-        )
     if ended.converged:
         text = f"Converged after {iterations}."
         if state.far:

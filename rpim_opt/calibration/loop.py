@@ -459,7 +459,6 @@ class Ended:
     state: State
     x: Array
     certificate: Certificate
-    rounds: int = 1
     settled: bool = True
 
     @property
@@ -482,12 +481,12 @@ def minimize(
         return ended
     about = ended.x
     moved = np.zeros(len(about))
-    for rounds in range(2, ROUNDS + 1):
+    for _ in range(ROUNDS - 1):
         loop = replace(loop, about=about)
         before = ended
         ended = _certified(loop, problem, loop.run(weight, ended.x))
         history = (*before.state.history, *ended.state.history)
-        ended = replace(ended, rounds=rounds, state=replace(ended.state, history=history))
+        ended = replace(ended, state=replace(ended.state, history=history))
         step = ended.x - about
         if not ended.converged or ended.state.relative(float(np.linalg.norm(step / loop.scale))) <= SAME_POSITIONS:
             return ended

@@ -393,15 +393,10 @@ def contact_remarks(problem: CalibrationProblem) -> list[str]:
     """Return remarks on what touches show and what they do not; empty if there are none."""
     if problem.touches is None:
         return []
-    planar = problem.touches.planar
-    nearest = ["the mean of all touches of its point"] * (not all(planar))
-    nearest += ["the best-fit plane of all its touches"] * any(planar)
-    definition = f"Error of a touch: the modelled distance of the tool from {', or '.join(nearest)}"
-    reach = "robots reach" if len(problem.arms) > 1 else "robot reaches"
-    consistently = f"the error shows how consistently the {reach} them from all sides"
     remarks = [
-        f"{definition}. True places were not measured: {consistently}. Touches do not identify the base frame or the "
-        "offset of the first joint."
+        "Error of a touch: the modelled distance of the tool from the mean of all touches of its point, or from the "
+        "best-fit plane of all touches of its plane. True places were not measured: the error shows how consistently "
+        "they are reached from all sides. Touches do not identify the base frame or the offset of the first joint."
     ]
     if not any(tie.kind == "known_distance" for tie in problem.touches.ties):
         remarks.append("The scale of the robot rests on its nominal lengths: a [[known_distance]] would determine it.")

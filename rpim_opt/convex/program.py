@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -75,7 +74,6 @@ class Estimate(Brief):
     multipliers: Callable[[], tuple[Array, ...]] = tuple
     status: str = OPTIMAL
     iterations: int = 0
-    seconds: float = 0.0
 
     def _short(self) -> str:
         return f"{self.status} at weight {self.weight:.4g}: loss {self.loss:.4g}, penalty {self.penalty:.4g}"
@@ -359,22 +357,19 @@ class Program(Brief):
         when the solver does not end with "optimal", or its point misses the constraints; its ``conflict`` names what
         contradicts what.
         """
-        begin = time.perf_counter()
         weight = self._weight(weight)
         if solver or settings or verbose:
-            estimate = self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
-        elif self.structure.joint:
-            estimate = self._by_cvxpy(weight, damping, cp.CLARABEL, TIGHT, False)
-        elif weight == 0 and not self.linear_penalty:  # what multiplies zero is no part of the program
+            return self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
+        if self.structure.joint:
+            return self._by_cvxpy(weight, damping, cp.CLARABEL, TIGHT, False)
+        if weight == 0 and not self.linear_penalty:  # what multiplies zero is no part of the program
             alone = self._part(self.structure.without_penalty, self.model).solve(damping=damping)
-            estimate = replace(alone, penalty=self.value(alone.z, 0.0)[1])
-        elif damping is None and self.closed_form:
-            estimate = self._at(self._closed(weight), weight)
-        elif weight == 0 and damping is None and not self.model.svd[1].all():
-            estimate = self._unidentified()
-        else:
-            estimate = self._by_structure(weight, damping)
-        return replace(estimate, seconds=time.perf_counter() - begin)
+            return replace(alone, penalty=self.value(alone.z, 0.0)[1])
+        if damping is None and self.closed_form:
+            return self._at(self._closed(weight), weight)
+        if weight == 0 and damping is None and not self.model.svd[1].all():
+            return self._unidentified()
+        return self._by_structure(weight, damping)
 
     def _closed(self, weight: float) -> Array:
         """Return the minimum (n,) of squares and a quadratic penalty, by QR unless it is ill-conditioned."""

@@ -31,8 +31,6 @@ TIE = 0.01  # errors that differ by no more than this part are a tie
 ENOUGH = 5  # problems from which on an interval speaks of problems like them; with fewer, of these
 BOOTSTRAP_DRAWS = 4000
 CONFIDENCE = 0.95
-ROW_INCHES = 0.25  # height of a method in a figure
-LARGEST_RATIO = 30.0  # ratios beyond are drawn at the edge
 SAME_DATA = ("problem", "split", "fold", "count", "seed")
 """Columns in which two replicates of a pair agree: then they saw the same data."""
 Pair = tuple[Any, ...]
@@ -454,7 +452,13 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     >>> len(figure.axes)
     1
     """
-    ax = _axes(list(values), label, 0.32 * len(values) + 0.9)
+    from matplotlib.figure import Figure  # which nothing but a figure needs
+
+    ax = Figure(figsize=(7, 0.32 * len(values) + 0.9), layout="constrained").add_subplot()
+    ax.set_yticks(range(len(values)), list(values), fontsize=8)
+    ax.set_ylim(len(values) - 0.3, -0.7)
+    ax.set_xlabel(label)
+    ax.grid(axis="x", alpha=0.25)
     for y, known in enumerate(values.values()):
         dots = ax.plot(known, [y] * len(known), "o", ms=3, alpha=min(1.0, 5 / len(known) ** 0.5), color="C0", mew=0)
         dots[0].set_rasterized(len(known) > 50)  # thousands of dots would make megabytes of SVG
@@ -466,39 +470,22 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
 
 
 def _ratios(summary: Summary, of: Mapping[str, Mapping[Pair, float]]) -> Any:
-    """Return the figure: methods from top to bottom, their ratios as dots, the mean with the ends of its interval."""
+    """Return the figure: ratios of the methods that have some, with their medians, and intervals of their means."""
     other = of[summary.reference]
+    ratios = {
+        each.method: [value / other[pair] for pair, value in of[each.method].items() if other.get(pair)]
+        for each in summary.standings
+    }
+    known = [each for each in summary.standings if ratios[each.method]]
     label = f"{summary.metric} over that of {summary.reference}, same replicate"
-    names = [each.method for each in summary.standings]
-    ax = _axes(names, label, max(ROW_INCHES * len(names) + 1.5, 3.5), dpi=150)
+    figure = distributions({each.method: ratios[each.method] for each in known}, label)
+    (ax,) = figure.axes
     ax.axvline(1, color="0.4", lw=1, zorder=1)
-    for y, each in enumerate(summary.standings):
-        values = [own / other[pair] for pair, own in of[each.method].items() if other.get(pair)]
-        alpha = min(0.5, 3 / max(len(values), 1) ** 0.5)
-        ax.plot(_inside(values), np.full(len(values), y), "o", ms=3.5, color="C0", alpha=alpha, mew=0, zorder=2)
-        colour = "0.3"
+    for y, each in enumerate(known):
         if each.low is not None and each.high is not None:
+            colour = "0.3"
             if each.different:
                 colour = "C2" if each.high < 1 else "C3"
-            ax.plot(_inside([each.low, each.high]), [y, y], lw=2, color=colour, zorder=3, solid_capstyle="butt")
-        if each.ratio is not None:
-            ax.plot(_inside([each.ratio]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
-    ax.set_title("dots: replicates; marks: geometric mean, 95 % interval", fontsize=9)
-    logarithmic(ax, "x")
-    return ax.figure
-
-
-def _axes(names: Sequence[str], label: str, height: float, **options: Any) -> Any:
-    """Return the axes of a new figure with named rows from top to bottom."""
-    from matplotlib.figure import Figure  # which nothing but a figure needs
-
-    ax = Figure(figsize=(7, height), layout="constrained", **options).add_subplot()
-    ax.set_yticks(range(len(names)), names, fontsize=8)
-    ax.set_ylim(len(names) - 0.3, -0.7)
-    ax.set_xlabel(label)
-    ax.grid(axis="x", alpha=0.25)
-    return ax
-
-
-def _inside(ratios: Any) -> Any:
-    return np.clip(ratios, 1 / LARGEST_RATIO, LARGEST_RATIO)
+            ax.plot([each.low, each.high], [y, y], lw=2, color=colour)
+    ax.set_title("dots: replicates, medians marked; bars: 95 % interval of the geometric mean", fontsize=9)
+    return figure

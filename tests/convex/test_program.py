@@ -79,7 +79,6 @@ def test_a_solution_is_that_of_the_written_problem(name: str, constraints: tuple
     assert program.violation(ours.z) <= 1e-7
     for mine, other in zip(ours.duals, theirs.duals, strict=True):
         assert mine == pytest.approx(other, rel=2e-2, abs=2e-2 * max(1.0, np.abs(mine).max()))
-    assert ours.seconds > 0
     if program.quadratic and program.box is not None:  # a formula, or an active set
         assert ours.iterations == 0
 
@@ -163,7 +162,7 @@ def test_an_estimates_objective_leaves_out_a_penalty_without_weight() -> None:
     assert Estimate(Z, 0.0, 3.0, float("inf")).objective == 3.0
     formula = Estimate(Z, 2.0, 3.0, 4.0)
     assert formula.objective == 11.0
-    assert (formula.status, formula.iterations, formula.seconds, formula.duals) == ("optimal", 0, 0.0, ())
+    assert (formula.status, formula.iterations, formula.duals) == ("optimal", 0, ())
 
 
 def test_a_point_outside_a_domain_is_moved_inside() -> None:

@@ -84,10 +84,10 @@ def test_the_page_says_of_many_problems_how_many_and_which_have_no_figure(tmp_pa
     assert "6 of 6 replicates" in all_of_them.read_text(encoding="utf-8")
 
 
-def test_marks_tell_by_colour_what_is_better_and_what_worse() -> None:
+def test_intervals_tell_by_colour_what_is_better_and_what_worse() -> None:
     axes = compared({"a": even(1.0), "b": even(2.0), "c": even(0.5)}).plot().axes[0]
-    marks = {round(line.get_xdata()[0], 6): line.get_color() for line in axes.lines if line.get_marker() == "D"}
-    assert marks == {1.0: "0.3", 2.0: "C3", 0.5: "C2"}
+    bars = {round(line.get_xdata()[0], 6): line.get_color() for line in axes.lines if line.get_linewidth() == 2}
+    assert bars == {1.0: "0.3", 2.0: "C3", 0.5: "C2"}
 
 
 def test_a_method_without_figures_is_not_drawn() -> None:
