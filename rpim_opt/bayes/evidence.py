@@ -524,12 +524,6 @@ def _eliminated(U: Array, equations: Array, v: Array) -> tuple[Array, Array, Arr
     Return the information G'(I + U diag(v) U')^-1 G of the equations, the regression C U'G of the coefficients on them,
     C = (U'U + diag(1 / v))^-1 and -ln|C|.
     """
-    if len(U) < len(v):  # among equations: I + U diag(v) U' = L L'
-        L = np.linalg.cholesky(np.eye(len(U)) + (U * v) @ U.T)
-        Y = solve_triangular(L, np.hstack([U * v, equations]), lower=True, check_finite=False)
-        follow, left = Y[:, : len(v)], Y[:, len(v) :]
-        logdet = 2 * float(np.sum(np.log(L.diagonal()))) - float(np.sum(np.log(v)))
-        return left.T @ left, follow.T @ left, np.diag(v) - follow.T @ follow, logdet
     if not len(v):
         return equations.T @ equations, np.zeros((0, equations.shape[1])), np.zeros((0, 0)), 0.0
     right = U.T @ equations

@@ -170,11 +170,8 @@ class NoiseTest(NamedTuple):
         return self.probability < UNLIKELY and self.ratio < 1
 
 
-def noise_test(squares: float, dof: float, learned: bool = False, factor: float = 1.0) -> NoiseTest:
-    """Compare a sum of squared whitened residuals with its chi-squared distribution.
-
-    ``learned``: the repeatability is known beside the noise; ``factor``: what is estimated on the stated noise.
-    """
+def noise_test(squares: float, dof: float) -> NoiseTest:
+    """Compare a sum of squared whitened residuals with its chi-squared distribution."""
     if dof < 1:
         return NoiseTest(1.0, 1.0, "No degrees of freedom remain to test the measurement noise.")
     ratio = float(np.sqrt(squares / dof))
@@ -184,11 +181,7 @@ def noise_test(squares: float, dof: float, learned: bool = False, factor: float 
         low, high = np.sqrt(chdtri(dof, [1 - UNLIKELY / 2, UNLIKELY / 2]) / dof)
         found = f"ratio {ratio:.2f}; by chance {low:.2f} to {high:.2f} in {100 * (1 - UNLIKELY):g} % of fits"
         return NoiseTest(ratio, probability, f"Residuals agree with the measurement noise ({found}).")
-    cause = "the noise is larger than stated, rows are wrong, or the model lacks an effect (backlash, compliance)"
-    if upper >= 0.5:
-        cause = "the noise is smaller than stated"
-        if learned and factor == 1.0:
-            cause += ' (--noise free, or repeatability = "free" in problem.toml, estimates it)'
-    elif learned:
-        cause = "the difference is the robot's repeatability, or an effect that the model lacks"
+    cause = "the noise is smaller than stated"
+    if upper < 0.5:
+        cause = "the robot's repeatability, noise larger than stated, wrong rows, or an effect that the model lacks"
     return NoiseTest(ratio, probability, f"Residuals are {ratio:.2f} times the measurement noise: {cause}.")

@@ -424,13 +424,11 @@ class Outcome:
         'Residuals agree with the measurement noise (ratio 1.02; by chance 0.81 to 1.19 in 99 % of fits).'
         """
         linear = self.squares
-        repeatability = self.problem.repeatability
-        if repeatability is None:
-            squares = float(np.sum((linear.A @ self.z - linear.b) ** 2)) / linear.factor
-            return noise_test(squares, self.fit_covariance.residual_dof)
-        bare = self.problem.with_repeatability(None)
-        squares = float(sum(np.sum(part.whitened_errors(self.x)[0] ** 2) for part in bare.rows()))
-        return noise_test(squares, self.fit_covariance.residual_dof, True, repeatability.instrument)
+        squares = float(np.sum((linear.A @ self.z - linear.b) ** 2)) / linear.factor
+        if self.problem.repeatability is not None:
+            bare = self.problem.with_repeatability(None)
+            squares = float(sum(np.sum(part.whitened_errors(self.x)[0] ** 2) for part in bare.rows()))
+        return noise_test(squares, self.fit_covariance.residual_dof)
 
     @property
     def noise_dof(self) -> float:

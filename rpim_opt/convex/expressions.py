@@ -270,36 +270,18 @@ def _by_cvxpy(e: Any, values: Sequence[Any], _: Any) -> list[Any]:
     return [part.diagonal() for part in parts]
 
 
-def _of_maximum(_: Any, values: Sequence[Any], value: Any) -> list[Any]:
-    free: Any = True  # where none of those before is the largest
-    parts = []
-    for each in values:
-        largest = free & (each == value)
-        parts.append(largest * 1.0)
-        free = free & ~largest
-    return parts
-
-
-def _of_product(_e: Any, values: Sequence[Any], _v: Any) -> list[Any]:
-    return [values[1], values[0]]
-
-
 DERIVATIVES: dict[str, Callable[[Any, Any, Any], list[Any]]] = {
     "AddExpression": lambda e, values, value: [1.0] * len(values),
     "NegExpression": lambda e, values, value: [-1.0],
     "Promote": lambda e, values, value: [1.0],
     "reshape": lambda e, values, value: [1.0],
     "DivExpression": lambda e, values, value: [1.0 / values[1], 0.0],
-    "multiply": _of_product,
-    "MulExpression": _of_product,
-    "huber": lambda e, values, value: [2 * np.clip(values[0], -e.M.value, e.M.value)],
-    "abs": lambda e, values, value: [np.sign(values[0])],
-    "maximum": _of_maximum,
+    "multiply": lambda e, values, value: [values[1], values[0]],
+    "MulExpression": lambda e, values, value: [values[1], values[0]],
     "logistic": lambda e, values, value: [1.0 / (1.0 + np.exp(-values[0]))],
-    "exp": lambda e, values, value: [value],
     "norm": lambda e, values, value: [each / np.maximum(value, 1e-300) for each in values],
 }
-"""Partial derivatives of the atoms that losses are mostly made of, from their parts' values and their own."""
+"""Partial derivatives, from their parts' values and their own, of atoms whose Jacobians take long or overflow."""
 
 
 class Term:
