@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import scipy
 from scipy.linalg import get_lapack_funcs
+from scipy.linalg import svd as scipy_svd
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -96,8 +96,11 @@ class LinearModel(Brief):
 
 
 def svd(A: Array) -> tuple[Array, Array, Array]:
-    """Return U, s, V' of A (m, n), of min(m, n) singular values; LAPACK's quicker driver fails with 514 parameters."""
-    return scipy.linalg.svd(A, full_matrices=False, check_finite=False, lapack_driver="gesvd")
+    """Return U, s, V' of A (m, n), of min(m, n) singular values."""
+    try:
+        return np.linalg.svd(A, full_matrices=False)
+    except np.linalg.LinAlgError:  # as LAPACK's quicker driver ends with 514 parameters of 80 sessions
+        return scipy_svd(A, full_matrices=False, lapack_driver="gesvd")
 
 
 NARROW, WIDE, MANY = 8, 32, 100
