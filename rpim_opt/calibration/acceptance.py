@@ -478,9 +478,7 @@ def _held_out(
         )
         missed += [moved] if moved else []
     if count < FEWEST:
-        measured = any(region.rows(part.data).any() for part in result.problem.rows())
-        reason = f"Missing: at least {FEWEST} held-out rows in the region; it holds {count} of {rows}."
-        lacking.append(reason if measured else f"{reason} No identification row is in it either.")
+        lacking.append(f"Missing: at least {FEWEST} held-out rows in the region; it holds {count} of {rows}.")
     if beyond or held.contradiction:
         outside = f"Rows outside them: {listed(beyond, MOST)}." if beyond else ""
         advice = moved or "Repeat these measurements, or extend the model."

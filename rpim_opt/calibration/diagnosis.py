@@ -94,10 +94,9 @@ class Outside:
         if not self.rows:
             return []
         by = ", ".join(f"joint {joint}: {count}" for joint, count in self.joints.items())
-        lie = "lies" if len(self.rows) == 1 else "lie"
         return [
-            f"{len(self.rows)} of {self.count} rows {lie} well outside the measured joint ranges ({by}): no "
-            "measurement checked the model there, and errors may exceed its intervals."
+            f"Rows well outside the measured joint ranges: {len(self.rows)} of {self.count} ({by}). No measurement "
+            "checked the model there, and errors may exceed its intervals."
         ]
 
 

@@ -132,9 +132,8 @@ class LackOfFit:
         """Return the paragraph, sentence by sentence."""
         rms = f"Residual RMS per reading {_size(self, self.residual)}"
         if not self.instrument:
-            count = max(round(self.residual_dof), 0)
-            degrees = "1 degree of freedom is" if count == 1 else f"{count} degrees of freedom are"
-            return [f"{rms}; {degrees} too few to separate its components. Measure more configurations."]
+            freedom = f"degrees of freedom: {max(round(self.residual_dof), 0)}, too few to separate its components"
+            return [f"{rms}; {freedom}. Measure more configurations."]
         parts = [f"measurement noise {_size(self, self.instrument)}"]
         if self.repeatable:
             parts.append(f"missing effects {_size(self, self.repeatable)}")

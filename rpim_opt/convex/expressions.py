@@ -196,10 +196,7 @@ def called(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
     """Call a user's function, and turn its errors into an InputError."""
     try:
         return function(*arguments)
-    except cp.SolverError as error:  # atoms that call a solver when they are made
-        found = f"an error of CVXPY: {error}".rstrip(".")
-        raise InputError(where, found, "atoms that the installed solvers know") from None
-    except NotImplementedError as error:  # CVXPY's word on strict inequalities
+    except (cp.SolverError, NotImplementedError) as error:  # of atoms that call a solver, and strict inequalities
         raise InputError(where, f"{error}".rstrip("."), "expressions of CVXPY, with <=, >= or ==") from error
     except (TypeError, RuntimeError) as error:
         if any(text in str(error) for text in OF_NUMPY):

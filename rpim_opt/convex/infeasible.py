@@ -112,7 +112,5 @@ def advice(structure: Structure, status: str, found: Conflict | None, solver: st
         return (
             "its constraints are feasible, but not to the solver's accuracy: check their units, or loosen them slightly"
         )
-    remedy = (
-        "add a penalty, with a weight above zero" if structure.formulation.penalty is None else "use a larger weight"
-    )
-    return f"the solver did not reach its accuracy: {remedy}, or use another solver (solver=..., settings=...)"
+    remedy = "add a penalty or use a larger weight, or use another solver (solver=..., settings=...)"
+    return f"the solver did not reach its accuracy: {remedy}"

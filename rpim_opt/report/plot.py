@@ -72,9 +72,7 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     at = [i for i, label in enumerate(labels) if label in flagged]
     if at:
         _dots(ax, place[at], after[at], "mark", "flagged")
-    cut = np.count_nonzero(both < low)
-    note = f"\n{cut} errors below {low:.2g} mm are drawn at the lower edge." * bool(cut)
-    ax.set(xlabel=f"row{note}", ylabel="error [mm]")
+    ax.set(xlabel="row", ylabel="error [mm]")
     if few:
         _name(ax, "x", labels)
     logarithmic(ax, "y")

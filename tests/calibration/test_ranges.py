@@ -38,9 +38,9 @@ def test_tenth_of_a_range_is_to_spare_and_a_degree_of_one_that_stood_still(q, jo
 def test_rows_are_named_by_their_numbers_and_counted_by_joint():
     found = outside(RANGES, rows([[0, 1, 0.5], [3, 1, 0.5], [0, 1, 0.5], [3, 5, 0.5]]))
     assert found == Outside(4, (1, 3), {1: 2, 2: 1})
-    assert "2 of 4 rows lie well outside" in found.sentences()[0]
+    assert "Rows well outside the measured joint ranges: 2 of 4" in found.sentences()[0]
     assert "(joint 1: 2, joint 2: 1)" in found.sentences()[0]
-    assert "1 of 4 rows lies" in outside(RANGES, rows([[3, 1, 0.5]] + 3 * [[0, 1, 0.5]])).sentences()[0]
+    assert "ranges: 1 of 4 (joint 1: 1)" in outside(RANGES, rows([[3, 1, 0.5]] + 3 * [[0, 1, 0.5]])).sentences()[0]
 
 
 def test_every_point_of_a_row_counts():
@@ -68,7 +68,7 @@ def test_predictions_validation_and_commands_say_it():
     data = ro.Dataset.of(q, result.predict(q).position, 5e-5, label=("near", "far"))
     found = ro.use.validate(result, data)
     assert found.content()["outside"] == ["far"]
-    assert "1 of 2 rows lies well outside the measured joint ranges (joint 1: 1)" in str(found)
+    assert "Rows well outside the measured joint ranges: 1 of 2 (joint 1: 1)" in str(found)
     within = ro.use.validate(result, data.take([0]))
     assert within.content()["outside"] == []
     assert "outside the measured joint ranges" not in str(within)

@@ -121,9 +121,8 @@ def choice(name: str, weights: Array, score: Array, best: int, note: str, at_edg
     if not inside:
         note = at_edge or EDGES["lower" if best == 0 else "upper"]
     note += skipped(int(failed.sum()))
-    beside = inside and bool(failed[[best - 1, best + 1]].any())
-    note += ", also beside this one: another weight may be better" * beside
-    return Selection(float(weights[best]), name, weights[~failed], score[~failed], inside and not beside, note)
+    interior = inside and not failed[[best - 1, best + 1]].any()
+    return Selection(float(weights[best]), name, weights[~failed], score[~failed], bool(interior), note)
 
 
 def solved(program: Program, weights: Sequence[float] | Array) -> list[Estimate | None]:
