@@ -249,17 +249,13 @@ def _parts(compared: Comparison, model: Candidate, known: Repeatability | None =
     """Return the RMS of a row's instrument, robot (in position, or orientation without lengths) and joints."""
     repeatability = known or model.evidence.repeatability(model.point.logs)
     only = replace(repeatability, instrument=0.0, joint=0.0)
-    own = repeatability.orientation if compared.dimension == "angle" else repeatability.position
     squares = {"instrument": 0.0, "position": 0.0, "joint": 0.0}
     for stack in model.evidence.data.stacks:
         which = stack.of(compared.dimension)
         variance = np.einsum("nkk->nk", stack.instrument)
         squares["instrument"] += repeatability.instrument**2 * float(np.sum(variance[which]))
         squares["joint"] += repeatability.joint**2 * float(np.sum(np.sum(stack.joint**2, axis=2)[which]))
-        if compared.dimension == "pixel":
-            squares["position"] += float(np.sum(np.einsum("nkk->nk", stack.covariance(only))[which]))
-        else:
-            squares["position"] += own**2 * float(np.sum(which))
+        squares["position"] += float(np.sum(np.einsum("nkk->nk", stack.covariance(only))[which]))
     return {kind: float(np.sqrt(total / compared.rows)) for kind, total in squares.items()}
 
 

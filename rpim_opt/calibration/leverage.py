@@ -21,7 +21,6 @@ from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import bounding, moved, predicted
 from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
-from rpim_opt.robot.parameters import of_joint, own_name
 
 ALONE = 1e-9  # a configuration decides a direction alone where others know less than this share of it
 UNIDENTIFIABLE = 1e-9  # standard deviations below, in scales, are rounding: the data do not see the parameter
@@ -192,7 +191,7 @@ def improvement(result: Outcome) -> Improvement | None:
     N is that of leaving out every configuration in turn (the jackknife) where that exceeds what noise predicts: then
     the rows of a configuration err together, by the robot or by the camera, and more of them do not help.
 
-    For a squared penalty or none, and one robot with joint limits, in one place or several (`together`).
+    For a squared penalty or none, and one robot with joint limits.
 
     >>> import rpim_opt as ro
     >>> found = ro.calibration.improvement(ro.load("position").calibrate())
@@ -227,25 +226,17 @@ def _slopes(result: Outcome) -> tuple[Array, Array]:
     """Return the slopes of flange positions less what fitting base and tool takes back, (3 W, n) and (W, 3, n)."""
     problem = result.problem.sample()
     parameters = result.problem.parameters
-    robot = next(iter(problem.arms))
-    joints = [name for name in parameters.free.names if of_joint(name) or name in parameters.terms]
-    own = [name for name in joints if own_name(name) != name]
-    if own:  # several problems are one machine where they share all of the joints
-        raise InputError("improvement", f"several robots: '{own[0]}' belongs to one only", "one robot")
-    columns = parameters.free.places_of(robot)
-    of_robot = parameters.of_robot(robot)
-    tools = np.array([name.startswith("tool_") for name in of_robot.names])
-    nominal = np.where(tools, 0.0, of_robot.nominal)
-    at = np.where(tools[of_robot.identified], 0.0, result.x[columns])
-    there = CalibrationProblem(problem.arms[robot], replace(of_robot, nominal=nominal), problem.alone(robot).data)
+    tools = np.array([name.startswith("tool_") for name in parameters.names])
+    nominal = np.where(tools, 0.0, parameters.nominal)
+    at = np.where(tools[parameters.identified], 0.0, result.x)
+    there = CalibrationProblem(problem.robot, replace(parameters, nominal=nominal), problem.data)
     q = bounding(there, None, None)
     p = predicted(there, q, None, at=at).position
-    J = np.zeros((len(p), 3, len(result.x)))
-    J[:, :, columns] = moved(there, q, None, at=at).slope
+    J = moved(there, q, None, at=at).slope
     D = J.reshape(-1, J.shape[2])
     p = p - p.mean(axis=0)
     turning = np.cross(np.eye(3), p[:, None])
-    base = numeric_frame(nominal[of_robot.frame("base_")])
+    base = numeric_frame(nominal[parameters.frame("base_")])
     along = base[:3, :3] @ forward_kinematics(there.robot, q)[:, :3, :3]
     fitting = np.concatenate([np.tile(np.eye(3), (len(p), 1, 1)), turning, along], axis=2).reshape(-1, 9)
     U = np.linalg.qr(fitting)[0]
