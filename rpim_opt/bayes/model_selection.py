@@ -213,9 +213,8 @@ class Comparison(Models):
         if result.learned is not None:
             estimator = Estimator(KNOWN, NOISE + ("instrument",) * ("instrument" in result.learned.noise))
         problem = sampled(result.problem.with_repeatability(None))  # in memory, without noise estimates
-        labels = {label: i for i, label in enumerate(problem.labels)}
-        rows = np.array([labels[flag.label] for flag in result.flagged if flag.label in labels], dtype=int)
-        if 0 < len(rows) <= len(labels) / 4:  # without flagged rows unless their neighbours are
+        rows = np.flatnonzero(np.isin(problem.labels, [flag.label for flag in result.flagged]))
+        if 0 < len(rows) <= len(problem.labels) / 4:  # without flagged rows unless their neighbours are
             alone = {problem.labels[i] for i in rows[~clustered(problem, result.x, rows)]}
             problem = problem.without(alone)
         super().__init__(problem, estimator, named(result.problem, result.x))

@@ -507,10 +507,8 @@ class Outcome:
         problem = self.problem
         if not self.flagged or not isinstance(problem, CalibrationProblem):
             return ()
-        index = {label: i for i, label in enumerate(problem.labels)}
-        rows = np.array([index[flag.label] for flag in self.flagged])
-        together = coherent(problem, self.x, rows)
-        return tuple(flag.label for flag, kept in zip(self.flagged, together, strict=True) if kept)
+        rows = np.flatnonzero(np.isin(problem.labels, [flag.label for flag in self.flagged]))
+        return tuple(problem.labels[i] for i in rows[coherent(problem, self.x, rows)])
 
     @property
     def single(self) -> tuple[Flag, ...]:
