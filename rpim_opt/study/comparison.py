@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr, stdtrit
+from scipy.special import stdtrit
 
 from rpim_opt.basics.arrays import TINY
 from rpim_opt.basics.exceptions import InputError, choices, pick
@@ -29,7 +29,6 @@ COVERED = "covered_percent"  # the metric of which neither less nor more is bett
 MOST_DRAWS = 100_000  # each is a calibration of its own, and is listed before the first begins
 TIE = 0.01  # errors that differ by no more than this part are a tie
 ENOUGH = 5  # problems from which on an interval speaks of problems like them; with fewer, of these
-BOOTSTRAP_DRAWS = 4000
 CONFIDENCE = 0.95
 SAME_DATA = ("problem", "split", "fold", "count", "seed")
 """Columns in which two replicates of a pair agree: then they saw the same data."""
@@ -377,10 +376,9 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
     """Return the geometric mean of paired ratios, given as logarithms, and the ends of its 95 % interval.
 
     Replicates of one problem have the problem in common. The mean is over problems, of each one's mean; and with five
-    problems or more it is they that are resampled (cluster bootstrap), so that the interval refers to other problems
-    like these. With fewer, what is independent within each is: the arms of a generator, the seeds or else the folds of
-    a measured one; then it speaks of other such arms, seeds or folds. Percentiles are those of Hesterberg (2015, The
-    American Statistician 69), wider for few.
+    problems or more Student's interval is by how these scatter, so that it refers to other problems like these. With
+    fewer, by how what is independent within each scatters: the arms of a generator, the seeds or else the folds of a
+    measured one; then it speaks of other such arms, seeds or folds.
     """
     if not ratios:
         return None, None, None
@@ -394,20 +392,17 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
             parts.setdefault(part, []).append(ratio)
         groups.append(np.array([float(np.mean(each)) for each in parts.values()]))
     means = np.array([each.mean() for each in groups])
-    middle = float(np.exp(means.mean()))
-    rng = np.random.default_rng(0)
-    count = len(means)
-    if count >= ENOUGH:
-        drawn_means = rng.choice(means, (BOOTSTRAP_DRAWS, count)).mean(axis=1)
+    middle = float(means.mean())
+    if len(means) >= ENOUGH:
+        count = len(means)
+        variance = means.var(ddof=1) / count
     else:
-        count = min(len(each) for each in groups)
+        count = min(map(len, groups))
         if count < ENOUGH:
-            return middle, None, None
-        within = [rng.choice(each, (BOOTSTRAP_DRAWS, len(each))).mean(axis=1) for each in groups]
-        drawn_means = np.mean(within, axis=0)
-    beyond = ndtr(np.sqrt(count / (count - 1)) * stdtrit(count - 1, (1 - CONFIDENCE) / 2))
-    low, high = np.quantile(drawn_means, [beyond, 1 - beyond])
-    return middle, float(np.exp(low)), float(np.exp(high))
+            return float(np.exp(middle)), None, None
+        variance = sum(each.var(ddof=1) / len(each) for each in groups) / len(groups) ** 2
+    half = float(stdtrit(count - 1, (1 + CONFIDENCE) / 2) * np.sqrt(variance))
+    return float(np.exp(middle)), float(np.exp(middle - half)), float(np.exp(middle + half))
 
 
 def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> Iterator[str]:
@@ -423,7 +418,7 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         scope = "these problems alone, with other seeds or folds"
     if compared:
         several = " They are not corrected for multiple comparisons." * (compared > 1)
-        yield f"Intervals refer to {scope} (bootstrap, {CONFIDENCE:.0%}); * excludes 1.{several}"
+        yield f"Intervals refer to {scope} (Student's t, {CONFIDENCE:.0%}); * excludes 1.{several}"
     elif len(standings) > 1:
         yield f"There are no intervals: fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one."
     every = Counter(row["method"] for row in rows)
