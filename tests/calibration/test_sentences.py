@@ -73,8 +73,8 @@ def left(rms: float, **more: Any) -> LackOfFit:
 
 
 LEFT: dict[str, tuple[LackOfFit, str, str]] = {
-    "none spare": (LackOfFit(3, 9, 1.0, "length", 1e-4), "1 degree of freedom is too few", "measurement noise"),
-    "few spare": (LackOfFit(3, 9, 3.2, "length", 1e-4), "3 degrees of freedom are too few", "measurement noise"),
+    "none spare": (LackOfFit(3, 9, 1.0, "length", 1e-4), "degrees of freedom: 1, too few", "measurement noise"),
+    "few spare": (LackOfFit(3, 9, 3.2, "length", 1e-4), "degrees of freedom: 3, too few", "measurement noise"),
     "effects": (
         left(1e-4, instrument=1e-4, present={"gravity": 30.0, "first harmonic": 9.0}),
         "gravity (likelihood-ratio statistic 30). Encoders or gears of joints have once-per-revolution errors "

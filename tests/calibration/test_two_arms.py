@@ -99,7 +99,7 @@ def test_a_result_goes_to_a_file_and_a_report(result, tmp_path: Path) -> None:
     assert np.allclose(again.errors(), result.errors(), atol=1e-12)
     ro.report.write_report(result, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
-    assert "how consistently the robots reach them from all sides" in page
+    assert "how consistently they are reached from all sides" in page
 
 
 def test_a_point_is_in_one_fold_whoever_touched_it(cell) -> None:

@@ -54,7 +54,7 @@ def test_zeros_of_joint_1_are_as_uncertain_as_its_prior_where_the_base_was_regis
 def test_the_noise_is_compared_with_the_declared() -> None:
     for factor, word in (
         (1.0, "agree with the measurement"),
-        (5.0, "rows are wrong"),
+        (5.0, "wrong rows"),
         (0.2, "smaller than stated"),
     ):
         problem, _ = simulated(noise=factor * 5e-5, seed=1)

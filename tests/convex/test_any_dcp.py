@@ -114,7 +114,7 @@ def test_what_cvxpy_makes_with_a_solver_needs_that_solver() -> None:
     if "SCS" in cp.installed_solvers():
         assert ro.calibrate(problem, stated, 1.0).converged
         return
-    with pytest.raises(ro.InputError, match="penalty: found an error of CVXPY: The solver SCS is not installed"):
+    with pytest.raises(ro.InputError, match="penalty: found The solver SCS is not installed"):
         ro.calibrate(problem, stated, 1.0)
 
 
