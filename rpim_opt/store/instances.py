@@ -138,8 +138,11 @@ def load(
         formulation = _formulation(definition, problem)
         prior = problem_file.stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
         problem = problem.with_parameters(prior.where_known(problem.parameters, problem.parameters))
-        if definition.base is None:
-            _require_values_of_base(prior)
+        unstated = [name for each in prior.statements if each.reference is None for name in each.names]
+        for name in unstated:
+            if definition.base is None and name.startswith("base_"):
+                found = f"'{name}' without a value, where base = \"auto\""
+                raise InputError("key prior.known", found, f"'{name} = ... +- ...', or a table [base]")
         details = problem_file.stated_details(table.record)
         with problem_file.at_key("reading", path, part=True):
             TableOptions.stated(table.reading)
@@ -180,14 +183,6 @@ def load(
         held_out=table.held_out,
         constraints=formulation.constraints[len(formulation_of(table.formulation).constraints) :],
     )
-
-
-def _require_values_of_base(prior: Prior) -> None:
-    """Refuse known parameters of a base without a value, where the problem states no base."""
-    for name in (name for each in prior.statements if each.reference is None for name in each.names):
-        if name.startswith("base_"):
-            found = f"'{name}' without a value, where base = \"auto\""
-            raise InputError("key prior.known", found, f"'{name} = ... +- ...', or a table [base]")
 
 
 def _of_chains(stated: problem_file.ProblemFile, parts: Mapping[str, Instance]) -> Instance:
