@@ -49,7 +49,7 @@ class Extension(NamedTuple):
 
 
 EXTENSIONS = {
-    "gravity": Extension(("compliance?",), "gravity", "The arm deflects under gravity", ("compliance", "bend")),
+    "gravity": Extension(("compliance?",), "gravity", "The arm deflects under gravity", ("compliance", "moment")),
     "first harmonic": Extension(
         ("ecc_cos?", "ecc_sin?"),
         "eccentric encoders or gears (once per revolution)",
@@ -59,7 +59,7 @@ EXTENSIONS = {
     "second harmonic": Extension(
         ("ecc2_cos?", "ecc2_sin?"), "second harmonics of joints", "Joints have twice-per-revolution errors", ("ecc2",)
     ),
-    "moments": Extension(("bend*",), "gravity on masses whose centres differ from the assumed ones"),
+    "moments": Extension(("moment*",), "gravity on masses whose centres differ from the assumed ones"),
     SESSIONS: Extension(
         ("session_*",),
         "a registration that differs from session to session",

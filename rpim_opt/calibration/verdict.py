@@ -101,7 +101,7 @@ OUTSIDE = 2.0  # ranges of a joint by which no other zero puts its values outsid
 SCALES = 10.0  # scales by which a parameter of the robot may deviate
 LARGEST_CURVE = 0.01  # standard deviation of transmission errors [rad] beyond any gear: real ones are below 1 mrad
 LARGEST = {"length": 0.02, "angle": 0.05}  # a machined and assembled robot deviates by less than this [m, rad]
-ARM = ("compliance", "bend", "ecc", "transmission")  # beginnings of extension parameters that are the arm's own
+ARM = ("compliance", "moment", "ecc", "transmission")  # beginnings of extension parameters that are the arm's own
 NOTHING = (
     "None of the tested input mistakes explains the residuals. Check the nominal parameters; is the arm compliant?"
 )

@@ -32,7 +32,7 @@ DEFLECTIONS = {
     "compliance": "deflection of joints under gravity",
     "ecc": "first harmonic of joints",
     "ecc2": "second harmonic of joints",
-    "bend": "deflection of links under gravity",
+    "moment": "deflection of links under gravity",
 }
 """Model extensions whose scales are reported as deflections, at the configuration where these are largest."""
 UNUSUAL = 10.0  # scales of its group beyond which a deviation is said to be unusual: 2 in 1000 are under Student's t_3

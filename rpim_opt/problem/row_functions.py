@@ -222,7 +222,7 @@ def needed(robot: Robot, parameters: Parameters) -> Dependencies:
     needs = dependencies(robot.model, robot.joint_types, names.__contains__)
     return needs._replace(
         torques=needs.torques or any(name.startswith("compliance") for name in of_arms),
-        moments=any(name.startswith("bend") for name in of_arms),
+        moments=any(name.startswith("moment") for name in of_arms),
     )
 
 

@@ -14,7 +14,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.robot.kinematics import call_rows, table_symbols, transforms
 from rpim_opt.robot.mdh import MDH, STANDARD, Gravity, Robot
-from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS, Configuration, Symbol, Weight
+from rpim_opt.robot.terms import JOINT_TERMS, MOMENT_SCALE, Configuration, Symbol, Weight
 
 GUESS = ((5.0, None), (10.0, 4))
 """Masses [kg] at the origin of a frame, None for the last: what an arm is taken for that states none."""
@@ -132,7 +132,7 @@ def moment_slopes(robot: Robot, q: Array) -> Array:
     """Return derivatives of joint torques by first moments of links (N, dof, dof, 3), by joint i, link k and axis a.
 
     z_i . (R_k e_a x g_hat) of the nominal arm at q (N, dof) of the controller; zero for k < i and for prismatic joints.
-    A joint's deflection is the sum of these times the parameters ``bend{i}_{k}{a}`` [rad].
+    A joint's deflection is the sum of these times the parameters ``moment{i}_{k}{a}`` [rad].
     """
     return _evaluated(robot, q)[1].reshape(-1, len(robot.mdh), len(robot.mdh), 3)
 
@@ -151,8 +151,8 @@ def _draws(robot: Robot) -> Array:
 
 
 @lru_cache(maxsize=64)
-def bend_names(robot: Robot) -> tuple[str, ...]:
-    """Return the non-redundant parameters ``bend{i}_{k}{a}`` of a robot.
+def moment_names(robot: Robot) -> tuple[str, ...]:
+    """Return the non-redundant parameters ``moment{i}_{k}{a}`` of a robot.
 
     Over random joint values, those whose slope (`moment_slopes`) is neither constant nor, but for a factor and a
     constant, that of an earlier one of the same joint. With constants they represent all that masses of links can do to
@@ -172,7 +172,7 @@ def bend_names(robot: Robot) -> tuple[str, ...]:
             v = v / size
             if all(min(np.linalg.norm(v - u), np.linalg.norm(v + u)) >= SAME for u in known):
                 known.append(v)
-                names.append(f"bend{i + 1}_{k + 1}{AXES[a]}")
+                names.append(f"moment{i + 1}_{k + 1}{AXES[a]}")
     return tuple(names)
 
 
@@ -195,7 +195,7 @@ def model_extensions(robot: Robot) -> dict[str, tuple[str, ...]]:
         "gravity": tuple(f"compliance{i}" for i in bending),
         "first harmonic": tuple(f"ecc_{wave}{i}" for i in revolute for wave in ("cos", "sin")),
         "second harmonic": tuple(f"ecc2_{wave}{i}" for i in revolute for wave in ("cos", "sin")),
-        "moments": bend_names(robot),
+        "moments": moment_names(robot),
     }
 
 
@@ -211,8 +211,8 @@ def extension_scales(robot: Robot, names: Iterable[str]) -> Array:
     n = len(robot.mdh)
     largest = {f"ratio{i}": np.pi for i in range(1, n + 1)}
     largest |= {f"compliance{i}": torque for i, torque in enumerate(torques, start=1)}
-    largest |= {f"bend{i + 1}_{k + 1}{AXES[a]}": slopes[i, k, a] for i, k, a in np.ndindex(n, n, 3)}
-    usual = {term.name: term.entries[0].scale for term in JOINT_TERMS} | {"bend": BEND_SCALE}
+    largest |= {f"moment{i + 1}_{k + 1}{AXES[a]}": slopes[i, k, a] for i, k, a in np.ndindex(n, n, 3)}
+    usual = {term.name: term.entries[0].scale for term in JOINT_TERMS} | {"moment": MOMENT_SCALE}
     scales = []
     for name in names:
         kind = re.fullmatch(r"(\w+?)\d+(_\d+[xyz])?", name)

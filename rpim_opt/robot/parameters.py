@@ -15,10 +15,10 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import Tabled
 from rpim_opt.basics.units import SMALLEST, display, fits, quantities, split_unit
-from rpim_opt.robot.extensions import bend_names
+from rpim_opt.robot.extensions import moment_names
 from rpim_opt.robot.kinematics import FRAME_DIMENSION, numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, Robot
-from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS, Entry, Model
+from rpim_opt.robot.terms import JOINT_TERMS, MOMENT_SCALE, Entry, Model
 
 EXPANSION, REFERENCE = "expansion", "reference_temperature"
 """By how much all lengths of a robot grow with temperature, and the temperature at which they are nominal."""
@@ -35,7 +35,7 @@ STEEL = 12e-6  # by how much steel grows [1/K]; aluminium by 23e-6
 SHOWN = 4  # names in one line
 NUMBERS = ("nominal", "scale", "tolerance", "identified")  # fields of `Parameters` that are arrays
 _TABLE = re.compile(rf"({'|'.join(MDH)})\d+")
-_TERM = re.compile(rf"({'|'.join(term.name for term in JOINT_TERMS)})\d+|bend\d+_\d+[xyz]")
+_TERM = re.compile(rf"({'|'.join(term.name for term in JOINT_TERMS)})\d+|moment\d+_\d+[xyz]")
 
 
 # Names
@@ -96,7 +96,7 @@ def reflectors(names: Iterable[str]) -> list[str]:
 
 
 def known_patterns(names: Sequence[str], pattern: str) -> str:
-    """Return the patterns of the known names as text: ``alpha?``, ``bend?_?x``, ``base_x``."""
+    """Return the patterns of the known names as text: ``alpha?``, ``moment?_?x``, ``base_x``."""
     return "names, or patterns such as " + choices(pattern, dict.fromkeys(re.sub(r"\d", "?", name) for name in names))
 
 
@@ -154,7 +154,7 @@ class Parameters(Tabled):
         rows: list[dict[str, Any]] = []
         for i, (name, dimension) in enumerate(zip(self.names, self.dimensions, strict=True)):
             # a joint's deflection under gravity, as compliances state it
-            unit, si = ("mrad", 1e-3) if own_name(name).startswith("bend") else display(dimension)
+            unit, si = ("mrad", 1e-3) if own_name(name).startswith("moment") else display(dimension)
             figures = {column: float(values[i] / si) for column, values in columns.items()}
             known = {column: value if np.isfinite(value) else None for column, value in figures.items()}
             rows.append({"parameter": name, "unit": unit, **known})
@@ -398,7 +398,7 @@ def model_parameters(
     for i in range(1, len(robot.mdh) + 1):
         for term in JOINT_TERMS:
             entries += term.named(i) if i in term.places(robot.joint_types) else []
-    entries += [Entry(name, "angle", BEND_SCALE, 0.0) for name in bend_names(robot)]
+    entries += [Entry(name, "angle", MOMENT_SCALE, 0.0) for name in moment_names(robot)]
     for prefix, place in frames.items():
         for (axis, dimension), value in zip(FRAME_DIMENSION.items(), place, strict=True):
             entries.append(_usual(prefix + axis, dimension, value))

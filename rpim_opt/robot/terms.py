@@ -26,7 +26,9 @@ ENDS = ("base", "tool")  # places that an arm has once: parameters there have no
 EXPECTED_WAVE = 1e-5  # scale of one harmonic of a transmission error before it is estimated [rad]
 SOMEWHERE, ROUNDING = 0.5, 1e-12
 """Value [SI] of whatever a term sees where its motion with all parameters zero is evaluated, and what may be left."""
-BEND_SCALE = 1e-4  # prior standard deviation of a joint's deflection by one component of one link's first moment [rad]
+MOMENT_SCALE = (
+    1e-4  # prior standard deviation of a joint's deflection by one component of one link's first moment [rad]
+)
 
 
 # What a term sees
@@ -430,10 +432,13 @@ JOINT_TERMS = (
 
 @lru_cache
 def terms_of(dof: int) -> tuple[Term, ...]:
-    """Return all terms of an arm: `JOINT_TERMS`, and those of the first moments of links, ``bend{i}_{k}{axis}``."""
-    bends = [
-        Term(lambda joint, size, k=k, axis=axis: size * joint.moment(k, axis), {f"bend{{}}_{k}{axis}_rad": BEND_SCALE})
+    """Return all terms of an arm: `JOINT_TERMS`, and those of the first moments of links, ``moment{i}_{k}{axis}``."""
+    moments = [
+        Term(
+            lambda joint, size, k=k, axis=axis: size * joint.moment(k, axis),
+            {f"moment{{}}_{k}{axis}_rad": MOMENT_SCALE},
+        )
         for k in range(1, dof + 1)
         for axis in "xyz"
     ]
-    return (*JOINT_TERMS, *bends)
+    return (*JOINT_TERMS, *moments)

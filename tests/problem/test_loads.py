@@ -14,7 +14,7 @@ from tests.data.test_measurement import KINDS, random_problem
 from tests.robot.test_gravity import random_robot
 from tests.simulate import ARM, simulated
 
-TERMS = ("compliance?", "bend*", "backlash?", "theta?")
+TERMS = ("compliance?", "moment*", "backlash?", "theta?")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -30,7 +30,7 @@ def test_jacobians_under_gravity_are_differences_of_residuals(kind: str) -> None
     h = np.where(np.array(free.dimensions) == "compliance", 1e-7, 1e-5)
     x = 5e3 * h * rng.normal(size=len(free))
     J = problem.jacobian(x)
-    gravity = [i for i, name in enumerate(free.names) if name.startswith(("compliance", "bend"))]
+    gravity = [i for i, name in enumerate(free.names) if name.startswith(("compliance", "moment"))]
     assert np.abs(J[:, gravity]).max() > 0.1
     for i in gravity:
         step = h[i] * (np.arange(len(free)) == i)
@@ -122,7 +122,7 @@ def test_a_nominal_compliance_bends_a_robot_too() -> None:
 
 def test_what_no_parameter_asks_for_is_not_evaluated() -> None:
     problem, _ = simulated(("a?", "ecc2_*"), configurations=4)
-    for patterns, gravity in (("a?", None), ("compliance3", ARM.gravity), ("bend3_4x", ARM.gravity)):
+    for patterns, gravity in (("a?", None), ("compliance3", ARM.gravity), ("moment3_4x", ARM.gravity)):
         needs = needed(ARM, problem.parameters.identify([patterns]))
         assert loads_of(ARM, needs, problem.data, problem.data.blocks[0]).gravity is gravity
 

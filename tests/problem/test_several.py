@@ -240,7 +240,7 @@ def test_one_robot_in_two_campaigns_is_one_robot_with_two_bases() -> None:
     assert np.abs(found.covariance / np.sqrt(np.outer(np.diag(same.covariance), np.diag(same.covariance)))
                   - same.covariance / np.sqrt(np.outer(np.diag(same.covariance), np.diag(same.covariance)))
                   ).max() < 1e-7  # fmt: skip
-    apart = ro.together(spring=spring, autumn=autumn, shared=["[!b]*", "beta?", "bend*", "backlash?"])
+    apart = ro.together(spring=spring, autumn=autumn, shared=["[!b]*", "beta?", "moment*", "backlash?"])
     assert len(apart.parameters.free) == len(problem.parameters.free) + 6
 
 

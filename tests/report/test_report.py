@@ -127,12 +127,12 @@ def test_sections_stand_in_the_order_of_who_signs(arm_page) -> None:
 
 
 def test_parameters_state_their_flange_frame_and_units_as_they_are_written() -> None:
-    own = ("theta[2-6]", "compliance[23]", "bend2_*", "tool_[xyz]")
+    own = ("theta[2-6]", "compliance[23]", "moment2_*", "tool_[xyz]")
     problem, _ = simulated(own, 30, 5e-5, 2)
     result = ro.calibrate(problem, ro.tikhonov, 1.0)
     words = Reader(page(result)).words
     assert "compliance2 [mrad/(N m)]" in words
-    bends = [i for i, name in enumerate(result.problem.parameters.free.names) if name.startswith("bend2")]
+    bends = [i for i, name in enumerate(result.problem.parameters.free.names) if name.startswith("moment2")]
     rows = [result.parameter_rows()[i] for i in bends]
     assert {row["unit"] for row in rows} == {"mrad"}
     assert np.allclose([row["deviation"] for row in rows], 1e3 * result.x[bends])

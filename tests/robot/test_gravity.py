@@ -98,7 +98,7 @@ def test_the_bends_of_a_table_say_all_that_masses_of_links_can_do(seed: int) -> 
     torques = ro.robot.gravity_torques(robot, q)
     slopes = ro.robot.moment_slopes(robot, q)
     for i in range(robot.dof):
-        names = [name for name in ro.robot.bend_names(robot) if name.startswith(f"bend{i + 1}_")]
+        names = [name for name in ro.robot.moment_names(robot) if name.startswith(f"moment{i + 1}_")]
         places = [(int(name[:-1].split("_")[1]) - 1, "xyz".index(name[-1])) for name in names]
         # what a name was left out for: a constant, which the joint's offset says
         columns = np.column_stack([np.ones(len(q)), *(slopes[:, i, k, a] for k, a in places)])
@@ -107,23 +107,23 @@ def test_the_bends_of_a_table_say_all_that_masses_of_links_can_do(seed: int) -> 
 
 
 def test_the_bends_of_an_arm_do_not_hang_on_rounding() -> None:
-    names = ro.robot.bend_names(ARM)
+    names = ro.robot.moment_names(ARM)
     assert len(names) == 30
-    assert not [name for name in names if name.startswith("bend1_")]  # its axis is vertical
+    assert not [name for name in names if name.startswith("moment1_")]  # its axis is vertical
     rng = np.random.default_rng(0)
     for size in (1e-15, 1e-9, 1e-6, 1e-4):
         moved = replace(ARM, mdh=ARM.mdh + size * rng.normal(size=ARM.mdh.shape))
-        assert ro.robot.bend_names(moved) == names
-    assert ro.robot.bend_names(replace(ARM, mdh=ARM.mdh.round(4))) == names
+        assert ro.robot.moment_names(moved) == names
+    assert ro.robot.moment_names(replace(ARM, mdh=ARM.mdh.round(4))) == names
     on_the_wall = replace(ARM, gravity=ARM.gravity.mounted("wall"))
-    assert [name for name in ro.robot.bend_names(on_the_wall) if name.startswith("bend1_")]
+    assert [name for name in ro.robot.moment_names(on_the_wall) if name.startswith("moment1_")]
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_kept_bends_are_neither_constant_nor_repeated_and_left_ones_are(seed: int) -> None:
     for robot in (ARM, random_robot(seed)):
         slopes = ro.robot.moment_slopes(robot, _draws(robot))
-        kept = ro.robot.bend_names(robot)
+        kept = ro.robot.moment_names(robot)
         prismatic = [i for i, kind in enumerate(robot.joint_types) if kind == "prismatic"]
         assert not slopes[:, prismatic].any()
         for i in range(robot.dof):
@@ -131,7 +131,7 @@ def test_kept_bends_are_neither_constant_nor_repeated_and_left_ones_are(seed: in
                 slopes[:, i, k, a]
                 for k in range(robot.dof)
                 for a in range(3)
-                if f"bend{i + 1}_{k + 1}{'xyz'[a]}" in kept
+                if f"moment{i + 1}_{k + 1}{'xyz'[a]}" in kept
             ]
             correlations = np.corrcoef(mine) - np.eye(len(mine)) if len(mine) > 1 else np.zeros((1, 1))
             assert np.abs(correlations).max() < 1 - 1e-5
@@ -148,7 +148,7 @@ def test_extensions_are_expected_to_bend_a_joint_by_a_tenth_of_a_milliradian() -
     for name, scale in zip(names, scales, strict=True):
         if name.startswith("compliance"):
             effect = torques[:, int(name[-1]) - 1]
-        elif name.startswith("bend"):
+        elif name.startswith("moment"):
             effect = slopes[:, int(name[4]) - 1, int(name[6]) - 1, "xyz".index(name[7])]
         else:
             effect = np.ones(1)

@@ -27,7 +27,7 @@ OWN: dict[str, tuple[Callable, dict]] = {
     "ecc2_cos": (lambda joint, size: size * ca.cos(2 * joint.q), {"own_mrad": 0.1}),
     "compliance": (lambda joint, size: size * joint.gravity, {"own_mrad_per_Nm": 0.01}),
     "backlash": (lambda joint, size: size * joint.approach, {"own_mrad": 0.1}),
-    "bend{}_5x": (lambda joint, size: size * joint.moment(5, "x"), {"own_mrad": 0.1}),
+    "moment{}_5x": (lambda joint, size: size * joint.moment(5, "x"), {"own_mrad": 0.1}),
 }
 """Built-in terms, and what a user would write for them."""
 

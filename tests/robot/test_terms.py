@@ -51,7 +51,7 @@ def effects(rng: np.random.Generator) -> dict[str, tuple[np.ndarray, dict]]:
         "compliance3": (ro.robot.gravity_torques(ARM, Q)[:, 2], {}),
         "compliance3 and a payload": (borne, {"payload": payload}),
         "compliance3 and torques": (torque[:, 0, 2], {"torque": torque}),
-        "bend3_5y": (slopes[:, 2, 4, 1], {}),
+        "moment3_5y": (slopes[:, 2, 4, 1], {}),
     }
 
 
@@ -66,7 +66,7 @@ def test_a_term_moves_its_joint_by_parameter_times_effect(name: str) -> None:
 
 
 def test_terms_add_up() -> None:
-    values = {"ecc_cos2": 1e-3, "ecc2_sin2": -2e-3, "compliance2": 1e-5, "bend2_3x": 3e-4, "ratio2": 1e-3}
+    values = {"ecc_cos2": 1e-3, "ecc2_sin2": -2e-3, "compliance2": 1e-5, "moment2_3x": 3e-4, "ratio2": 1e-3}
     q = Q[:, 1]
     bent = 1e-5 * ro.robot.gravity_torques(ARM, Q)[:, 1] + 3e-4 * ro.robot.moment_slopes(ARM, Q)[:, 1, 2, 0]
     moved = Q.copy()
@@ -100,7 +100,7 @@ def test_a_prismatic_joint_has_a_ratio_and_nothing_else() -> None:
     robot = ro.robot.Robot("lift", ARM.mdh, ("prismatic", *["revolute"] * 5))
     names = ro.robot.model_parameters(robot).names
     assert [name for name in names if of_term(name) and name.endswith("1")] == ["ratio1"]
-    assert not [name for name in names if name.startswith("bend1")]
+    assert not [name for name in names if name.startswith("moment1")]
     assert "ecc_cos2" in names
 
 
@@ -112,7 +112,7 @@ def test_an_effect_that_is_not_needed_is_not_written_down() -> None:
         def moment(self, i: int, k: int, axis: str) -> float:
             raise AssertionError(i, k, axis)
 
-    values = {"ecc_cos1": 0.1, "compliance1": 0.0, "bend1_1x": ca.SX(0)}
+    values = {"ecc_cos1": 0.1, "compliance1": 0.0, "moment1_1x": ca.SX(0)}
     [link] = transforms(("revolute",), Configuration([0.5], weight=Never()), lambda name: values.get(name, 0.0))
     angle = 0.5 + 0.1 * np.cos(0.5)
     assert ca.DM(link).full()[:2, 0] == pytest.approx([np.cos(angle), np.sin(angle)])
@@ -137,5 +137,5 @@ def test_names_say_what_a_parameter_belongs_to() -> None:
 
 
 def test_names_are_listed_as_patterns() -> None:
-    with pytest.raises(ro.InputError, match=r"'bend1_1x', accepted: .*bend\?_\?x"):
-        ro.robot.model_parameters(ARM).identify(["bend1_1x"])
+    with pytest.raises(ro.InputError, match=r"'moment1_1x', accepted: .*moment\?_\?x"):
+        ro.robot.model_parameters(ARM).identify(["moment1_1x"])

@@ -245,7 +245,7 @@ def test_a_payload_that_cannot_count_is_refused() -> None:
 
 def test_free_first_moments_are_predicted_and_compensated() -> None:
     robot = arm("wall")
-    bends = ro.robot.bend_names(robot)[:12]
+    bends = ro.robot.moment_names(robot)[:12]
     parameters = table(robot, bends)
     x = 2e-4 * np.random.default_rng(0).normal(size=12)
     q = np.random.default_rng(1).uniform(-1.5, 1.5, (60, 6))
@@ -336,7 +336,7 @@ def test_gravity_is_stated_in_a_problems_folder(tmp_path: Path) -> None:
     problem = ro.load(tmp_path).problem
     assert problem.robot.gravity == ro.robot.Gravity().mounted("wall").carrying(2.0, (0, 0, 0.08))
     assert problem.data.blocks[0].payload is not None
-    assert [name for name in problem.parameters.names if name.startswith("bend1_")]
+    assert [name for name in problem.parameters.names if name.startswith("moment1_")]
     for stated, match in (
         ('mounting = "roof"\n', "key mounting: found 'roof'"),
         ("mounting = [0, 0, 0]\n", "mounting"),
