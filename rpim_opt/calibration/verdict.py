@@ -81,6 +81,7 @@ UNUSUAL = {"length": 0.004, "angle": 0.05}
 SCALED = 0.002  # common deviation of the longest link [m] from which a wrong scale is the likelier reason
 UNSCALED, MOST_SCALED = 0.005, 0.3
 """Common deviation from which on no machined robot has it, and beyond which no scale is off, but a unit."""
+LENGTHS = 3  # identified ones below which a common deviation is no more than that of each
 SIGMAS, COMMON = 3.0, 0.6  # standard deviations of it that chance does not make, and its least part of all deviations
 ALIKE = 0.045  # part of an effect on the data that others may leave where these do not distinguish them
 DEPENDENT = 1e-6  # singular value of effects, over the largest, below which they are combinations of the others
@@ -232,7 +233,7 @@ def _stretch(result: Outcome) -> float:
     if C is None or any(_residuals(result, kept_rows(result))) or any(_deviations(result)):
         return 0.0
     lengths = (np.array(free.dimensions) == "length") & ~free.of_frames & (free.nominal != 0) & np.isfinite(np.diag(C))
-    if not lengths.any():
+    if lengths.sum() < LENGTHS:
         return 0.0
     nominal, x = free.nominal[lengths], result.x[lengths]
     scale = free.scale if result.learned is None else result.learned.stated

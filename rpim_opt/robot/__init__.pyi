@@ -1,6 +1,6 @@
 from .chain import RobotSetup as RobotSetup
 from .chain import without_beta as without_beta
-from .extensions import bend_names as bend_names
+from .extensions import moment_names as bend_names
 from .extensions import extension_scales as extension_scales
 from .extensions import gravity_torques as gravity_torques
 from .extensions import model_extensions as model_extensions

@@ -22,7 +22,7 @@ URDF = """<robot name="palletizer"><link name="base"/><link name="column"/><link
 <axis xyz="0 0 1"/><mimic joint="slide2" multiplier="0.5" offset="0.05"/></joint>
 <joint name="slide2" type="prismatic"><parent link="lift"/><child link="upper"/><origin rpy="0.3 0 0"/>
 <axis xyz="0 1 0"/><limit lower="0" upper="0.6"/></joint>
-<joint name="moment" type="revolute"><parent link="upper"/><child link="wrist"/><origin xyz="0.4 0 0" rpy="1.2 0 0"/>
+<joint name="bend" type="revolute"><parent link="upper"/><child link="wrist"/><origin xyz="0.4 0 0" rpy="1.2 0 0"/>
 <axis xyz="0 0 1"/><mimic joint="turn" multiplier="-0.7" offset="0.2"/></joint>
 <joint name="flange" type="fixed"><parent link="wrist"/><child link="tip"/><origin xyz="0.3 0.1 0"/></joint></robot>
 """
