@@ -27,7 +27,7 @@ from rpim_opt.use import recalibration
 from rpim_opt.use.sessions import registered_again, set_ups
 
 TESTS = 3  # each check alone, their sum, and every parameter: each may err by a third of `recalibration.FALSE_ALARM`
-MOMENTS = 40  # checks before which a change is looked for; of more so many, evenly
+MOMENTS = 40  # checks before which a change is looked for first; of more so many, and all around the best of a cause
 SMALLEST = 1e-12  # probabilities are taken as no smaller: 7 standard deviations
 ALLOWANCE = 0.5  # CUSUM's reference value k, taken off every deviate: sums answer fastest to a shift of twice as much
 CELLS = 150  # steps of a sum's range in the Markov chain of its distribution
@@ -337,10 +337,7 @@ def _drift(
     numbers, first = np.unique(problem.data.configuration, return_index=True)
     when = first[np.searchsorted(numbers, model.group)]
     count = len(problem.data)
-    moments = np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(int))
-    courses = [(int(first), False, (when >= first).astype(float)) for first in moments]
-    if count > 2:
-        courses.append((0, True, when / (count - 1)))
+    moments = np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(int)).tolist()
     width = recalibration.prior_widths(result, framed) / free.scale
     readings = dict(recalibration.readings(problem, model))
     causes = [*recalibration.candidates(free, problem.data), *readings]
@@ -349,24 +346,34 @@ def _drift(
     def tried(kept: Array) -> Iterator[tuple[float, Drift]]:
         """Yield explanations of the equations that are kept (m, 1), with logarithms of their probabilities."""
         misfit = recalibration.Misfit(result, replace(model, A=model.A * kept, b=model.b * kept[:, 0]), form)
-        for cause, prior in zip(causes, priors, strict=True):
+
+        def moved(cause: recalibration.Cause, prior: float, start: int, steady: bool = False) -> tuple[float, Drift]:
+            """Return a change before a check, or steadily: while readings are taken by a part of the whole."""
+            index = [free.names.index(name) for name in cause.members]
+            scale = float(free.scale[index[0]])
+            course = when / (count - 1) if steady else when >= start
+            g, G = misfit.projected(slice(misfit.m), kept * A[:, index] * course[:, None])
+            amount = None
+            if len(g) == 1 and G[0, 0] > 0:
+                change, std = scale * g[0] / G[0, 0], scale / np.sqrt(G[0, 0])
+                amount = recalibration.Moved(cause.name, free.dimensions[index[0]], float(change), float(std))
+            drift = Drift(misfit.evidence(cause, g, G), start, steady, amount)
+            return prior + recalibration.log_bayes_factor(g, G, width[index]), drift
+
+        for cause, prior in zip(causes, priors.tolist(), strict=True):
             if cause in readings:
                 rows = readings[cause]
                 change = misfit.projected(rows, kept[rows] * np.eye(len(rows)))
                 bayes = recalibration.log_bayes_factor(*change, np.full(len(rows), recalibration.OUTLIER_WIDTH))
                 yield prior + bayes, Drift(misfit.evidence(cause, *change), int(when[rows[0]]), False, None)
                 continue
-            index = [free.names.index(name) for name in cause.members]
-            scale = float(free.scale[index[0]])
-            for start, steady, course in courses:
-                # parameters that move while readings are taken, by a part of the whole change
-                g, G = misfit.projected(slice(misfit.m), kept * A[:, index] * course[:, None])
-                moved = None
-                if len(g) == 1 and G[0, 0] > 0:
-                    change, std = scale * g[0] / G[0, 0], scale / np.sqrt(G[0, 0])
-                    moved = recalibration.Moved(cause.name, free.dimensions[index[0]], float(change), float(std))
-                drift = Drift(misfit.evidence(cause, g, G), start, steady, moved)
-                yield prior + recalibration.log_bayes_factor(g, G, width[index]), drift
+            steps = [moved(cause, prior, start) for start in moments]
+            yield from steps
+            k = max(range(len(steps)), key=lambda k: steps[k][0])
+            around = range(moments[max(k - 1, 0)] + 1, moments[min(k + 1, len(moments) - 1)])
+            yield from (moved(cause, prior, start) for start in around if start not in moments)
+            if count > 2:
+                yield moved(cause, prior, 0, True)
 
     kept, wrong = np.ones((len(A), 1)), []
     while True:
