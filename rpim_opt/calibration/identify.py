@@ -99,8 +99,9 @@ def calibrate(
         ``"geometry"``, or ``"auto"``: model extensions (compliance under gravity, gear eccentricity, ...) are added
         where the evidence supports them.
     noise
-        What is estimated of it: ``"robot"``, the robot's repeatability beside the stated measurement noise; ``"free"``,
-        the measurement noise too; ``"level"``, one factor on the stated noise; ``"declared"``, nothing.
+        What ``"learned"`` weights estimate of it: ``"robot"``, the robot's repeatability beside the stated measurement
+        noise; ``"free"``, the measurement noise too; ``"level"``, one factor on the stated noise; ``"declared"``,
+        nothing. With another weight uncertainties follow the residuals where these are significantly larger.
     start
         (n,) deviations [SI] to begin with; nominal by default. Then signs and zeros of joints are sought where the
         nominal robot does not explain the data (`global_start`), and frames that are stated metres or half a turn from

@@ -1,9 +1,9 @@
 from .chain import RobotSetup as RobotSetup
 from .chain import without_beta as without_beta
-from .extensions import moment_names as bend_names
 from .extensions import extension_scales as extension_scales
 from .extensions import gravity_torques as gravity_torques
 from .extensions import model_extensions as model_extensions
+from .extensions import moment_names as moment_names
 from .extensions import moment_slopes as moment_slopes
 from .formats.tables import read_robot as read_robot
 from .formats.tables import write_robodk as write_robodk

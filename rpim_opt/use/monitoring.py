@@ -215,12 +215,12 @@ def monitor(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
         allowed=np.sqrt(equations * fdtri(equations, max(result.noise_dof, 1.0), 1 - level / count)),
         sums=cusum(deviate * right), limit=cusum_limit(count, level), drift=drift, wrong=wrong, registered=motion,
-        mistake=_mistake(result, data, right),
+        mistake=_mistake(result, data, right, explained=register and drift is not None),
     )  # fmt: skip
 
 
-def _mistake(result: Calibration, data: Dataset, right: np.ndarray) -> str:
-    """Return a likely mistake in checks (N,), or a change of the robot by those that are right; empty for none."""
+def _mistake(result: Calibration, data: Dataset, right: np.ndarray, explained: bool) -> str:
+    """Return a likely mistake in checks (N,), or unless ``explained`` a change by those that are right; or nothing."""
     names = set_ups(result, data)
     if len(names) > 1:
         with suppress(InputError):
@@ -229,9 +229,9 @@ def _mistake(result: Calibration, data: Dataset, right: np.ndarray) -> str:
                 return f"Likely: the instrument or the base moved between sessions {listed(names)}. Use --register."
     found = misread(result, data)
     data = data.take(np.flatnonzero(right))
-    return found or (
-        recalibration.moved_or_changed(result, data, held_out_errors(result, data))[0] if len(data) else ""
-    )
+    if found or explained or not len(data):
+        return found
+    return recalibration.moved_or_changed(result, data, held_out_errors(result, data))[0]
 
 
 def _framed(problem: CalibrationProblem) -> tuple[CalibrationProblem, list[int], np.ndarray]:

@@ -442,6 +442,31 @@ def test_joined_readings_keep_the_names_of_their_points(monkeypatch, capsys, tmp
     assert set(labels) == {f"{name[0]}/{marker}" for name in NAMED for marker in ("A", "B")}
 
 
+def test_one_log_of_joints_serves_points_that_are_measured_again(monkeypatch, capsys, tmp_path, arm) -> None:
+    """Monthly sessions at the same points: names repeat, and the times of one month alone are those of the log."""
+    joints, points = tmp_path / "joints.csv", tmp_path / "points.csv"
+    joints.write_text(
+        text(
+            [["Point", "Date", *HEAD[1:7]]],
+            [[*n, f"2026-01-05 08:{i:02}", *q] for i, (n, q) in enumerate(zip(NAMED, JOINTS, strict=True))],
+        )
+    )
+    rows = [
+        [*name, f"2026-0{month}-05 08:{i:02}", *point]
+        for month in (1, 2, 3)
+        for i, (name, point) in enumerate(zip(NAMED, POINTS, strict=True))
+    ]
+    points.write_text(text([["Target", "Time", *HEAD[7:]]], rows))
+    assert new(monkeypatch, arm, tmp_path / "none", [joints, points]) == 2
+    assert "accepted: --key with a column" in capsys.readouterr().err
+    assert new(monkeypatch, arm, tmp_path / "cell", [joints, points], "--key", "Target") == 0
+    assert f"{3 * COUNT} rows match, of {COUNT} with joints" in capsys.readouterr().out
+    sessions = [["Target", "Session", *HEAD[7:]]]
+    points.write_text(text(sessions, [[row[0], row[1][:7], *row[2:]] for row in rows]))
+    assert new(monkeypatch, arm, tmp_path / "two", [joints, points]) == 0
+    assert f"{3 * COUNT} rows match, of {COUNT} with joints" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("whole", [False, True])
 def test_a_group_for_every_configuration_has_points_that_are_reflectors(
     monkeypatch, capsys, tmp_path, arm, whole
@@ -578,7 +603,7 @@ def test_few_equal_times_are_asked_for_a_tolerance(monkeypatch, capsys, tmp_path
     error = capsys.readouterr().err.strip()
     assert "\n" not in error
     assert "the key column 'time [s]': found 4 common values in" in error
-    assert "accepted: --time-tolerance SECONDS for the nearest time, or --key 'time [s]' for equal ones alone" in error
+    assert "accepted: --key with a column that names the points, --time-tolerance SECONDS for the nearest" in error
     assert new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.004") == 0
     assert f"{COUNT} rows match" in capsys.readouterr().out
     assert new(monkeypatch, arm, tmp_path / "two", files, "--key", "time [s]") == 0

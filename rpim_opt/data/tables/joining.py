@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from bisect import bisect
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -156,7 +157,7 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
         raise InputError(f"the key {chosen.how}", f"'{next(iter(again))}' twice in {joints.file}", "unique keys")
     right = [i for i, name in enumerate(chosen.right) if name in place]
     times = not key and all(time_column([name]) for name in chosen.columns or [""])
-    few = len(right) < SAME * min(len(place), len(chosen.right))
+    few = len(right) < max(SAME * min(len(place), len(chosen.right)), len(chosen.right) / 2)
     if not right or (times and few):
         if not key and all(time_column(side.raw) is not None and len(side.labels) > 1 for side in (joints, values)):
             there, then = (_times(side, "")[1] for side in (joints, values))
@@ -168,10 +169,15 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
         accepted = f"--key with a column of common values, {OTHER_KEYS}"
         if times:
             accepted = (
-                f"--time-tolerance SECONDS for the nearest time, or --key '{chosen.columns[0]}' for equal ones alone"
+                f"--key with a column that names the points, --time-tolerance SECONDS for the nearest time, or --key "
+                f"'{chosen.columns[0]}' for equal ones alone"
             )
         raise InputError(f"the key {chosen.how}", found, accepted)
-    right.sort(key=lambda i: place[chosen.right[i]])
+    runs: dict[str, list[int]] = {}  # the measured rows of a name that begin a run of it: in every pass the same order
+    for i, name in enumerate(chosen.right):
+        if i == 0 or chosen.right[i - 1] != name:
+            runs.setdefault(name, []).append(i)
+    right.sort(key=lambda i: (bisect(runs[chosen.right[i]], i), place[chosen.right[i]]))
     names = [chosen.right[i] for i in right]
     counts = f"{len(right)} rows match, of {len(chosen.left)} with joints and {len(chosen.right)} measured"
     notes = [f"joined by {chosen.how}: {counts}."]
@@ -224,7 +230,7 @@ def _pairs(joints: CanonicalTable, values: CanonicalTable, key: str, numbers: bo
     """Return the keys that two columns make whose values, or the ``numbers`` in these, are nearly the same."""
     keys = (
         _keyed(f"{name} = {other}", (name.lower(), other.lower()), own, others, numbers)
-        for (name, own), (other, others) in product(_naming(joints).items(), _naming(values).items())
+        for (name, own), (other, others) in product(_naming(joints).items(), _naming(values, key).items())
         if key in ("", "row") or key.lower() in (name.lower(), other.lower())
     )
     sides = ((each, {*each.left}, {*each.right}) for each in keys)
@@ -251,17 +257,18 @@ def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]
     return Key(how + next(examples, ""), columns, left, named)
 
 
-def _naming(table: CanonicalTable) -> dict[str, list[str]]:
-    """Return the keys of columns, labels or left out, that name nearly every row, or row of a reflector, differently.
+def _naming(table: CanonicalTable, key: str = "") -> dict[str, list[str]]:
+    """Return the keys of columns, labels or left out, that name nearly every row of a reflector and session apart.
 
-    Some name is that of a reference point that was measured again.
+    Some name is that of a reference point that was measured again. The ``key`` may name rows that were.
     """
     free = [each.column for each in table.meant if each.name in ("", "label", "configuration")]
     free = [name for name in free if not COUNTER.fullmatch(name)]
     cells = {name: _normal(table.raw[name.lower()]) for name in free if name.lower() in table.raw}
-    markers = table.columns.get("marker", [""] * len(table.labels))
-    rows = {name: {*zip(keys, markers, strict=True)} for name, keys in cells.items()}
-    return {name: keys for name, keys in cells.items() if all(keys) and len(rows[name]) >= SAME * len(keys)}
+    apart = [table.columns[name] for name in ("marker", "session") if name in table.columns]
+    rows = {name: {*zip(keys, *apart, strict=True)} for name, keys in cells.items()}
+    unique = {name: name.lower() == key.lower() or len(rows[name]) >= SAME * len(cells[name]) for name in cells}
+    return {name: keys for name, keys in cells.items() if all(keys) and unique[name]}
 
 
 def _row_numbers(joints: CanonicalTable, values: CanonicalTable, pair: Key | None) -> Key:
