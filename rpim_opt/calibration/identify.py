@@ -27,6 +27,7 @@ from rpim_opt.convex.robust_loss import by_place
 from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.convex.select import weight_of
 from rpim_opt.problem.blocks import Source
+from rpim_opt.problem.multi_robot import require_affordable
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import relocated
 from rpim_opt.problem.registration.global_start import JointMapping, find_mapping
@@ -141,6 +142,7 @@ def calibrate(
     options = Options(max_iterations, tolerance, _logged(progress), solver, settings, verbose)
     told_apart = pick(MODELS, model, "model")
     kinds = tuple(kind for kind in pick(NOISE, noise, "noise") if kind in told_apart)
+    require_affordable(problem)
     require_finite(*(block.y for block in problem.sample().data.blocks))
     mapping: JointMapping | None = None
     stated: Source | None = None

@@ -149,7 +149,7 @@ def test_extensions_are_expected_to_bend_a_joint_by_a_tenth_of_a_milliradian() -
         if name.startswith("compliance"):
             effect = torques[:, int(name[-1]) - 1]
         elif name.startswith("moment"):
-            effect = slopes[:, int(name[4]) - 1, int(name[6]) - 1, "xyz".index(name[7])]
+            effect = slopes[:, int(name[6]) - 1, int(name[8]) - 1, "xyz".index(name[9])]
         else:
             effect = np.ones(1)
         assert scale * np.abs(effect).max() == pytest.approx(1e-4)
