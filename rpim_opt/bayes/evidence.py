@@ -221,27 +221,40 @@ class Point:
         return np.asarray(derivative, dtype=float)
 
     @cached_property
-    def _by_noise(self) -> tuple[Array, Array, Array]:
-        """The gradient (q,), X'R^-1 R_a u (q, p), and 2 u'R_a R^-1 R_b u - tr(P R_a P R_b) but `_weighed_twice`."""
+    def _by_noise(self) -> tuple[Array, Array, Array, list[Array]]:
+        """The gradient (q,), X'R^-1 R_a u (q, p), 2 u'R_a R^-1 R_b u - tr(P R_a P R_b) but `_weighed_twice`, X C."""
         q, p = len(self.evidence.noise), len(self.z)
-        gradient, f, among = np.zeros(q), np.zeros((q, p)), np.zeros((q, q))
+        gradient, f, among, products = np.zeros(q), np.zeros((q, p)), np.zeros((q, q)), []
         for part in self.parts:
             X, residual = part.X.reshape(-1, p), part.y - part.X @ self.z
             moved = (part.noise @ residual[:, :, None]).reshape(q, len(X))
             f += moved @ X
             XC = (X @ self.C).reshape(part.X.shape)  # one product: those of configurations take three times as long
+            products.append(XC)
             weighed = part.noise - 2 * XC @ part.X.transpose(0, 2, 1) @ part.noise
             gradient += np.einsum("ankk->a", part.noise + weighed) / 2 - moved @ residual.ravel()
             among += 2 * moved @ moved.T - np.einsum("anij,bnij->ab", part.noise, weighed)
-        return gradient, f, among
+        return gradient, f, among, products
 
     def _weighed_twice(self) -> tuple[Array, Array]:
         """Return tr(H R_a H R_b) (q, q), H = R^-1 X C X'R^-1, and diagonals (p, q) of C X'R^-1 R_a R^-1 X C."""
         q, p = len(self.evidence.noise), len(self.z)
+        X = np.concatenate([part.X.reshape(-1, p) for part in self.parts])
+        if len(X) < p:  # among equations: a third of the time
+            diagonals, rows = np.zeros((p, q)), []
+            for part, XC in zip(self.parts, self._by_noise[3], strict=True):
+                H = (XC.reshape(-1, p) @ X.T).reshape(*part.y.shape, -1)
+                rows.append((part.noise @ H).reshape(q, part.y.size, len(X)))
+                diagonals += np.einsum("ankp,nkp->pa", part.noise @ XC, XC)
+            M = np.concatenate(rows, axis=1)
+            return np.einsum("aij,bji->ab", M, M), diagonals
         M = np.zeros((q, p, p))
         for part in self.parts:
-            X = part.X.reshape(-1, p)
-            M += X.T @ (part.noise @ part.X).reshape(q, len(X), p)
+            values, U = np.linalg.eigh(part.noise)
+            roots = np.sqrt(np.maximum(values, 0.0))[..., None] * U.transpose(0, 1, 3, 2)
+            for a, root in enumerate(roots):  # products of a matrix with itself take half the time
+                half = (root @ part.X).reshape(-1, p)
+                M[a] += half.T @ half
         M = self.C @ M
         return np.einsum("aij,bji->ab", M, M), np.einsum("aij,ji->ia", M, self.C)
 
@@ -252,7 +265,7 @@ class Point:
         prior, heavy = evidence.prior, evidence.heavy
         s, e2 = len(prior.hyperparameters), z**2 + C.diagonal()
         size2, of_size, bend = prior.variances(self.logs)
-        by_noise, f, among = self._by_noise
+        by_noise, f, among, _ = self._by_noise
         twice, C_by_noise = self._weighed_twice()
         # how the mean follows noise, and e^2 at constant local variances
         z_by_noise = -C @ f.T
@@ -524,6 +537,12 @@ def _eliminated(U: Array, equations: Array, v: Array) -> tuple[Array, Array, Arr
     Return the information G'(I + U diag(v) U')^-1 G of the equations, the regression C U'G of the coefficients on them,
     C = (U'U + diag(1 / v))^-1 and -ln|C|.
     """
+    if len(U) < len(v):  # among equations: I + U diag(v) U' = L L'
+        L = np.linalg.cholesky(np.eye(len(U)) + (U * v) @ U.T)
+        Y = solve_triangular(L, np.hstack([U * v, equations]), lower=True, check_finite=False)
+        follow, left = Y[:, : len(v)], Y[:, len(v) :]
+        logdet = 2 * float(np.sum(np.log(L.diagonal()))) - float(np.sum(np.log(v)))
+        return left.T @ left, follow.T @ left, np.diag(v) - follow.T @ follow, logdet
     if not len(v):
         return equations.T @ equations, np.zeros((0, equations.shape[1])), np.zeros((0, 0)), 0.0
     right = U.T @ equations
