@@ -59,6 +59,7 @@ COMPARED = 200  # configurations at which mappings are compared
 WRITE = "write sign, and add the zeros to theta_deg (or theta_rad), of these joints in robot.toml"  # the remedy
 AS_STATED = "joints as stated"
 TOLD = 2  # other mappings of equal fit that are named, the best ones
+RARE_BASIN = 0.005  # probability of reaching a basin with one start whose probability of being missed is reported
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +89,7 @@ class JointMapping:
     zero: Array  # (dof,) [rad or m]
     nominal: float  # RMS error of the best three quarters of the points with joints as stated [m]
     left: float  # and with the mapping
+    starts: int  # random starts of the search
     alternatives: tuple[Alternative, ...] = ()  # of equal fit, with other predictions
     mirrored: bool = False  # whether a left-handed measured frame and joints as stated fit as well
     behind: str = ""  # joints that fit as well in a left-handed frame, as stated or one of them reversed
@@ -117,10 +119,12 @@ class JointMapping:
 
     @property
     def sentence(self) -> str:
-        """Return a sentence on the mapping and its errors."""
+        """Return a sentence on the mapping, its errors and its certainty."""
         return (
             f"Joint mapping estimated from the data: {described(self, self.sign, self.zero)} "
-            f"({three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.nominal)} mm)."
+            f"({three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.nominal)} mm; "
+            f"{self.starts} random starts: an optimum found by one start in {round(1 / RARE_BASIN)} is missed "
+            f"with a probability of {(1 - RARE_BASIN) ** self.starts:.1g})."
         )
 
     @property
@@ -280,10 +284,12 @@ def search(points: Points, problem: CalibrationProblem | None = None) -> JointMa
     one = _one_reversed(n)
     usual = np.vstack([signs, np.repeat(one, len(off), axis=0)])
     sign, pool = _round(few, usual, np.vstack([np.zeros_like(signs), np.tile(off, (len(one), 1))]))
+    starts = 0
     for _ in range(ROUNDS):
         drawn = signs[np.resize(rng.permutation(len(signs)), count)]
         begun, fits = _round(few, drawn, rng.uniform(-np.pi, np.pi, (count, n)) * turning)
         sign, pool = np.concatenate([sign, begun]), stacked([pool, fits])
+        starts += count
         if np.count_nonzero(pool.cost < 1.05 * pool.cost.min() + 1e-12) >= HITS:
             break
     best = np.argsort(pool.cost)[:64]  # they are fitted to all rows
@@ -291,7 +297,7 @@ def search(points: Points, problem: CalibrationProblem | None = None) -> JointMa
     zero, tools = np.vstack([near.zero, pool.zero[best]]), np.concatenate([near.tools, pool.tools[best]])
     candidates = _signed(points, sign)._replace(zero=zero, tools=tools)
     fits = fit_arms(candidates, LONG, zeros=True, robust=True, noise=LEAST_NOISE)
-    return _judged(points, problem, sign, fits, small, rng)
+    return _judged(points, problem, sign, fits, starts, small, rng)
 
 
 def _signed(points: Points, sign: Array) -> Candidates:
@@ -417,6 +423,7 @@ def _judged(
     problem: CalibrationProblem | None,
     sign: Array,
     fits: Fit,
+    starts: int,
     small: bool,
     rng: np.random.Generator,
 ) -> JointMapping | None:
@@ -467,7 +474,7 @@ def _judged(
     if changes < 2:  # fewer changes than a mirror and a joint
         behind = [name for name in behind if name == AS_STATED]
     return JointMapping(
-        points.robot.joint_types, sign[i], found.zeros[i], nominal, left, tuple(others),
+        points.robot.joint_types, sign[i], found.zeros[i], nominal, left, starts, tuple(others),
         mirrored=AS_STATED in behind, behind=" or ".join(behind), same=found.same(first), moved=float(found.moved[i]),
         lengths=_of_other_sign(points, MIRRORED * left), joint_names=points.robot.joint_names,
     )  # fmt: skip
