@@ -197,7 +197,7 @@ class Point:
         evidence, prior, heavy = self.evidence, self.evidence.prior, self.evidence.heavy
         size2, of_size, _ = prior.variances(self.logs)
         slope = 2 * (1 - (self.z**2 + self.C.diagonal()) / self.v)
-        slope[heavy] = (2 * prior.tails * (size2 / self.v - 1))[heavy]
+        slope[heavy] = 2 * prior.tails * (size2 / self.v - 1)[heavy]
         gradient = slope @ of_size / 2 + 2 * (evidence.root @ (self.logs - evidence.centre)) @ evidence.root
         gradient[len(prior.hyperparameters) :] += self._by_noise[0]
         return gradient
@@ -279,7 +279,7 @@ class Point:
         system = np.diag((prior.tails + 1) * v[heavy]) - follows[np.ix_(heavy, heavy)]
         log_v[heavy] = np.linalg.solve(system, wanted)
         slopes = 2 * (e2[:, None] * of_size - direct - follows @ log_v) / v[:, None]
-        slopes[heavy] = (2 * prior.tails * (size2 / v)[:, None] * (of_size - log_v))[heavy]
+        slopes[heavy] = 2 * prior.tails * ((size2 / v)[:, None] * (of_size - log_v))[heavy]
         curvature = 2 * evidence.root.T @ evidence.root
         of_scales = of_size[:, :s].T @ slopes / 2
         curvature[:s] += of_scales
