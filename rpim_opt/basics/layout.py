@@ -205,7 +205,7 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     lines_of_units = [f"units above the header: {' '.join(filter(None, row))}." for row, of_row in stated if of_row]
     table = _columns(grid, full, heads, replace(options, units={**units, **options.units}))
     left = set(range(numeric[0], len(grid.rows))).difference(full)
-    lines_of_units += [f"--columns has {len(others)} names, the header {len(heads)}: it is used."] * bool(others)
+    lines_of_units += [f"--columns has {len(others)} names, the header {len(heads)}: the header counts."] * bool(others)
     notes = (*grid.notes, *_notes(grid, above, left, options), *lines_of_units, *table.notes)
     return replace(table, notes=notes, units=units, left=[grid.rows[i] for i in sorted(left)])
 

@@ -415,7 +415,7 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
     measured = reached_positions(result, found.region, _measured(result), found.requirement.confidence)[1].max()
     apart = ""
     if measured < bound / 2:
-        apart = f", at measured configurations {1e3 * measured:.3f} mm (--measured tests these alone, --box a box)"
+        apart = f", at measured configurations {1e3 * measured:.3f} mm (--measured tests these alone, --box a part)"
     return (
         f"Missing: more measurements. U is at most {1e3 * bound:.3f} mm{apart}; with all parameters known the robot's "
         f"repeatability would still contribute {1e3 * repeatability:.3f} mm. `rpim-opt design --augment` names the "

@@ -432,8 +432,8 @@ def _cause(result: Outcome, i: int, largest: float) -> str:
         return "Neither the data nor a penalty determine it: add a penalty on it, or do not identify it."
     if not any(_residuals(result, kept_rows(result))):
         return (
-            "The data fit with it: check the robot file, whether it is of this model, and for misprints (of a standard "
-            "DH table a and alpha are in the row before)."
+            "The data fit with that: check the robot file for misprints, and whether it is of this model (in a "
+            "standard DH table a and alpha stand in the row before)."
         )
     return "Check the order, signs and units of the joint columns, and the DH table."
 
