@@ -237,7 +237,7 @@ def update(
     >>> first = ro.calibrate(problem.on(problem.data.take(np.arange(32))))
     >>> found = ro.use.update(first, problem.data.take(np.arange(32, 40)))
     >>> print(str(found).splitlines()[0])
-    No change of the robot is detectable from 8 readings: chi-squared 25.9 of 24, p-value 0.37.
+    No change of the robot is detectable from 8 readings: chi-squared 25.9, 24 degrees of freedom, p-value 0.37.
     >>> [earlier.title for earlier in found.result.record.earlier], found.changes
     (['ABB IRB 120-3/0.58'], ())
     """
