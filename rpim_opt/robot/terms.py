@@ -26,9 +26,7 @@ ENDS = ("base", "tool")  # places that an arm has once: parameters there have no
 EXPECTED_WAVE = 1e-5  # scale of one harmonic of a transmission error before it is estimated [rad]
 SOMEWHERE, ROUNDING = 0.5, 1e-12
 """Value [SI] of whatever a term sees where its motion with all parameters zero is evaluated, and what may be left."""
-MOMENT_SCALE = (
-    1e-4  # prior standard deviation of a joint's deflection by one component of one link's first moment [rad]
-)
+MOMENT_SCALE = 1e-4  # prior standard deviation of a joint's deflection by one component of a link's first moment [rad]
 
 
 # What a term sees

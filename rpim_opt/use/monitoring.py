@@ -339,8 +339,9 @@ def _drift(
     count = len(problem.data)
     moments = np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(int)).tolist()
     width = recalibration.prior_widths(result, framed) / free.scale
-    readings = dict(recalibration.readings(problem, model))
-    causes = [*recalibration.candidates(free, problem.data), *readings]
+    readings = list(recalibration.readings(problem, model))
+    equations = {cause.members: rows for cause, rows in readings}
+    causes = [*recalibration.candidates(free, problem.data), *(cause for cause, _ in readings)]
     priors = recalibration.log_priors(causes)
 
     def tried(kept: Array) -> Iterator[tuple[float, Drift]]:
@@ -361,8 +362,8 @@ def _drift(
             return prior + recalibration.log_bayes_factor(g, G, width[index]), drift
 
         for cause, prior in zip(causes, priors.tolist(), strict=True):
-            if cause in readings:
-                rows = readings[cause]
+            if cause.kind == "reading":
+                rows = equations[cause.members]
                 change = misfit.projected(rows, kept[rows] * np.eye(len(rows)))
                 bayes = recalibration.log_bayes_factor(*change, np.full(len(rows), recalibration.OUTLIER_WIDTH))
                 yield prior + bayes, Drift(misfit.evidence(cause, *change), int(when[rows[0]]), False, None)
@@ -384,7 +385,7 @@ def _drift(
         if best.cause.kind != "reading" or len(wrong) >= recalibration.SPARED * count:
             break
         wrong.append(best.cause)
-        kept[readings[best.cause._replace(gain=0.0, p_value=1.0)]] = 0.0
+        kept[equations[best.cause.members]] = 0.0
     least = best.cause.gain - recalibration.AS_GOOD
     others = dict.fromkeys(drift.cause.name for _, drift in found if drift.cause.gain > least)
     return best._replace(others=tuple(name for name in others if name != best.cause.name)), tuple(wrong)

@@ -93,6 +93,17 @@ def test_one_wrong_check_of_a_place_is_named_and_no_other(moves: bool) -> None:
         assert str(found).startswith("No drift in 23 of 24 checks.")
 
 
+@pytest.mark.parametrize("first", [50, 51, 52])
+def test_a_step_among_ninety_checks_is_found_at_its_own(first: int) -> None:
+    """Forty moments are tried first; one beside the true one shifts the change by many standard deviations."""
+    result, data = checked(0, np.where(np.arange(90) >= first, 1e-3, 0.0))
+    drift = ro.use.monitor(result, data).drift
+    assert drift is not None
+    assert (drift.cause.name, drift.first) == ("theta3", first)
+    assert drift.moved is not None
+    assert abs(drift.moved.change - 1e-3) < 4 * drift.moved.std
+
+
 def test_a_slow_drift_is_no_step() -> None:
     found = ro.use.monitor(*checked(2, np.linspace(0, 1e-3, CHECKS)))
     assert found.drift is not None

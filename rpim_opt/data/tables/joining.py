@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from bisect import bisect
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
-from itertools import product
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -159,25 +158,16 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
     times = not key and all(time_column([name]) for name in chosen.columns or [""])
     few = len(right) < max(SAME * min(len(place), len(chosen.right)), len(chosen.right) / 2)
     if not right or (times and few):
-        if not key and all(time_column(side.raw) is not None and len(side.labels) > 1 for side in (joints, values)):
-            there, then = (_times(side, "")[1] for side in (joints, values))
-            within = SIMULTANEOUS * float(min(np.diff(np.sort(there)).min(), np.diff(np.sort(then)).min()))
-            if within and len(partners(there, then, within)[1]) == len(then):
-                return _by_time(joints, values, key, within)
-        names = [f"{side.file} ({listed(keys, 3)})" for side, keys in ((joints, chosen.left), (values, chosen.right))]
-        found = f"{len(right) or 'no'} common values in {' and '.join(names)}"
-        accepted = f"--key with a column of common values, {OTHER_KEYS}"
-        if times:
-            accepted = (
-                f"--key with a column that names the points, --time-tolerance SECONDS for the nearest time, or --key "
-                f"'{chosen.columns[0]}' for equal ones alone"
-            )
-        raise InputError(f"the key {chosen.how}", found, accepted)
-    runs: dict[str, list[int]] = {}  # the measured rows of a name that begin a run of it: in every pass the same order
-    for i, name in enumerate(chosen.right):
-        if i == 0 or chosen.right[i - 1] != name:
-            runs.setdefault(name, []).append(i)
-    right.sort(key=lambda i: (bisect(runs[chosen.right[i]], i), place[chosen.right[i]]))
+        within = 0.0 if key else _simultaneous(joints, values)
+        if within:
+            return _by_time(joints, values, key, within)
+        raise _few_common(joints, values, chosen, len(right), times)
+    passes: dict[int, int] = {}  # how often the run of its name that a measured row is of has come
+    begun: Counter[str] = Counter()
+    for name, run in groupby(range(len(chosen.right)), chosen.right.__getitem__):
+        begun[name] += 1
+        passes |= dict.fromkeys(run, begun[name])
+    right.sort(key=lambda i: (passes[i], place[chosen.right[i]]))
     names = [chosen.right[i] for i in right]
     counts = f"{len(right)} rows match, of {len(chosen.left)} with joints and {len(chosen.right)} measured"
     notes = [f"joined by {chosen.how}: {counts}."]
@@ -189,6 +179,27 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
     if lonely:
         notes.append(f"without a match, ignored: {listed(lonely)}.")
     return Match([place[name] for name in names], right, names, notes, chosen.columns)
+
+
+def _simultaneous(joints: CanonicalTable, values: CanonicalTable) -> float:
+    """Return the tolerance [s] within which every measured row has its own row of joints in time, or 0."""
+    if any(time_column(side.raw) is None or len(side.labels) < 2 for side in (joints, values)):
+        return 0.0
+    there, then = (_times(side, "")[1] for side in (joints, values))
+    within = SIMULTANEOUS * float(min(np.diff(np.sort(there)).min(), np.diff(np.sort(then)).min()))
+    return within * (len(partners(there, then, within)[1]) == len(then))
+
+
+def _few_common(joints: CanonicalTable, values: CanonicalTable, key: Key, count: int, times: bool) -> InputError:
+    """Return the error that a key, or equal ``times``, are common to so few rows."""
+    names = [f"{side.file} ({listed(keys, 3)})" for side, keys in ((joints, key.left), (values, key.right))]
+    accepted = f"--key with a column of common values, {OTHER_KEYS}"
+    if times:
+        accepted = (
+            f"--key with a column that names the points, --time-tolerance SECONDS for the nearest time, or --key "
+            f"'{key.columns[0]}' for equal ones alone"
+        )
+    return InputError(f"the key {key.how}", f"{count or 'no'} common values in {' and '.join(names)}", accepted)
 
 
 def _key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Key:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -263,35 +263,53 @@ def _sheet_columns(raw: RawTable, units: Mapping[str, str]) -> tuple[dict[str, l
         unit = unit or raw.units.get(MDH_DIMENSION.get(stem, ""), "")
         if stem in JOINT_NAMES or not any(texts) or all(map(JOINT_NAME.fullmatch, texts)):
             continue
-        if stem in ANGLES and not unit:
-            unit = next((of for sign, of in SIGNS.items() if sign in "".join(texts).lower()), "")
-        if stem in ANGLES and not unit and len(stated) == 1:
-            turns = [_joint({f"{stem}_rad": text}).get(f"{stem}_rad") for text in texts]
-            degrees = any(isinstance(turn, float | int) and abs(turn) > LARGEST_TURN for turn in turns)
-            if not (degrees and "rad" in stated):  # radians in a column of degrees are refused below
-                (unit,) = stated
-                notes.append(f"column '{name}' states no unit: {unit}, as the other angles are.")
-        dimension = MDH_DIMENSION.get(stem, "")
-        if not unit and dimension in units:
-            unit = units[dimension]
-            notes.append(f"column '{name}' states no unit: {unit} by --units.")
-        if dimension and not unit:
-            accepted = " or ".join(f"{stem} [{of[dimension]}]" for of in (DISPLAY, SI)) + ", or --units deg,mm or rad,m"
-            raise InputError("the header", f"column '{name}' without a unit", accepted)
+        if not unit:
+            unit, note = _unstated(name, stem, texts, stated, units)
+            notes += filter(None, [note])
         stems = {stem: texts}
         if stem == "limits":
-            pairs = [BOTH_LIMITS.fullmatch(text) for text in texts]
-            if not all(pairs):
-                accepted = "cells as ±180 or -170..190, or columns lower [deg] and upper [deg]"
-                raise InputError("the header", f"both limits in a column, '{name}'", accepted)
-            lower = [f"-{each[1]}" if each[1] else each[2] or "" for each in pairs if each]
-            stems = {"lower": lower, "upper": [each[1] or each[3] or "" for each in pairs if each]}
+            stems = _both_limits(name, texts)
         for stem, texts in stems.items():
             key = stem + (f"_{unit}" if unit else "")
             if key in columns:
                 raise InputError("the header", ", ".join(raw.columns), "every column once")
             columns[key] = texts
     return columns, notes
+
+
+def _unstated(
+    name: str, stem: str, texts: Sequence[str], stated: Collection[str], units: Mapping[str, str]
+) -> tuple[str, str]:
+    """Return the unit of a column whose header has none, and a note on where it is from: cells, other angles, options.
+
+    Empty where it needs none; InputError where it needs one.
+    """
+    dimension = MDH_DIMENSION.get(stem, "")
+    if stem in ANGLES:
+        for sign, unit in SIGNS.items():
+            if sign in "".join(texts).lower():
+                return unit, ""
+        turns = [_joint({f"{stem}_rad": text}).get(f"{stem}_rad") for text in texts]
+        degrees = any(isinstance(turn, float | int) and abs(turn) > LARGEST_TURN for turn in turns)
+        if len(stated) == 1 and not (degrees and "rad" in stated):  # radians in a column of degrees are refused
+            (unit,) = stated
+            return unit, f"column '{name}' states no unit: {unit}, as the other angles are."
+    if dimension in units:
+        return units[dimension], f"column '{name}' states no unit: {units[dimension]} by --units."
+    if dimension:
+        accepted = " or ".join(f"{stem} [{of[dimension]}]" for of in (DISPLAY, SI)) + ", or --units deg,mm or rad,m"
+        raise InputError("the header", f"column '{name}' without a unit", accepted)
+    return "", ""
+
+
+def _both_limits(name: str, texts: Sequence[str]) -> dict[str, list[str]]:
+    """Return lower and upper limits of cells that hold both, ``±180``, ``-170..190``."""
+    pairs = [BOTH_LIMITS.fullmatch(text) for text in texts]
+    if not all(pairs):
+        accepted = "cells as ±180 or -170..190, or columns lower [deg] and upper [deg]"
+        raise InputError("the header", f"both limits in a column, '{name}'", accepted)
+    lower = [f"-{each[1]}" if each[1] else each[2] or "" for each in pairs if each]
+    return {"lower": lower, "upper": [each[1] or each[3] or "" for each in pairs if each]}
 
 
 def _stem(name: str) -> tuple[str, str]:
