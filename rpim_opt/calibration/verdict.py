@@ -364,7 +364,7 @@ def worse_than_nominal(nominal: Array, identified: Array, rows: str = "") -> str
 def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     """Say that residuals are beyond what instrument and robot make of them; of a camera in pixels and at the arm."""
     residuals = residual_rms(result, kept)
-    checked = _overdetermined(result)
+    checked = _overdetermined(result) and not result.record.noise_assumed
     for each, (size, ratio) in residuals.items():
         nominal = noise_ratio(result.problem, result.nominal_errors(dimension=each), each)  # with frames fitted
         small = 0 < min(ratio / OVERSTATED, NOISY * nominal) < 1  # 0: it was not measured

@@ -341,9 +341,11 @@ def test_a_noise_in_another_unit_is_not_delivered() -> None:
     problem = ro.load("position").problem
     (block,) = problem.data.blocks
     wrong = problem.on(replace(problem.data, blocks=(replace(block, covariance=1e6 * block.covariance),)))
-    verdict = ro.calibrate(wrong).verdict
-    assert not verdict.delivered
-    assert "in another unit" in str(verdict)
+    result = ro.calibrate(wrong)
+    assert not result.verdict.delivered
+    assert "in another unit" in str(result.verdict)
+    assumed = replace(result, record=replace(result.record, noise_assumed=True))  # which nobody stated in any unit
+    assert "in another unit" not in str(assumed.verdict)
 
 
 def test_a_loss_with_own_variables_is_judged_where_rows_are_flagged() -> None:
