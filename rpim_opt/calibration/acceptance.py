@@ -214,6 +214,14 @@ def measured_workspace(result: Calibration) -> Workspace | None:
     return sampled if np.isfinite(sampled.expanded).all() else None
 
 
+def tested(result: Calibration) -> tuple[Acceptance | None, Workspace | None]:
+    """Return the acceptance test of a result that has a requirement, and the workspace of the test or of the result."""
+    if result.record.requirement is None:
+        return None, measured_workspace(result)
+    accepted = accept(result)
+    return accepted, accepted.workspace
+
+
 def inconclusive(result: Calibration, found: Workspace | None) -> str:
     """Return a warning if U exceeds the error of the nominal robot; otherwise an empty text."""
     name, errors, _ = headline_errors(result)

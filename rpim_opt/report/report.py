@@ -21,7 +21,7 @@ from rpim_opt.basics.units import joint_columns, printed
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept
+from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, tested
 from rpim_opt.calibration.held_out import coverage_text, headline_errors, rows_used
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -39,7 +39,7 @@ from rpim_opt.report.summary import mm
 from rpim_opt.robot.parameters import own_name
 from rpim_opt.store.problem_file import FIELDS
 from rpim_opt.store.result_file import definition
-from rpim_opt.use.export import FLANGE, beyond_geometry, tested
+from rpim_opt.use.export import FLANGE, beyond_geometry
 from rpim_opt.use.sessions import in_session, session_notes
 from rpim_opt.use.validation import Validation
 

@@ -11,7 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.text import counted, listed, table
 from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import Workspace, inconclusive
+from rpim_opt.calibration.acceptance import Workspace, inconclusive, tested
 from rpim_opt.calibration.held_out import excluded_by_fit, headline_errors, of_positions, sets
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -20,7 +20,6 @@ from rpim_opt.data.measurements.contact import known_distance, known_parallel, k
 from rpim_opt.problem.linear import RANK_TOLERANCE
 from rpim_opt.store.problem_file import FIELDS
 from rpim_opt.store.result_file import figures
-from rpim_opt.use.export import tested
 from rpim_opt.use.sessions import in_session, session_notes
 
 COLUMNS = ("rows", "mean", "RMS", "95th percentile", "max")

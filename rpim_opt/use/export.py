@@ -23,7 +23,7 @@ from rpim_opt.basics.text import counted, joined, listed, percent
 from rpim_opt.basics.units import numeral
 from rpim_opt.bayes.model_selection import CONDITIONS
 from rpim_opt.bayes.prior_terms import prior_penalty
-from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
+from rpim_opt.calibration.acceptance import inconclusive, tested
 from rpim_opt.calibration.held_out import sets
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
@@ -190,14 +190,6 @@ def export_files(
     messages = write_all(writers, [f"{whole.record.identity}.", *beside])
     notes = list(dict.fromkeys([*beside, *of_geometry, *remarks, *messages]))
     return Exported([target for target, _ in writers], notes, undecided)
-
-
-def tested(result: Calibration) -> tuple[Acceptance | None, Workspace | None]:
-    """Return the acceptance test of a result that has a requirement, and the workspace of the test or of the result."""
-    if result.record.requirement is None:
-        return None, measured_workspace(result)
-    accepted = accept(result)
-    return accepted, accepted.workspace
 
 
 def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tuple[str, list[str], list[str], bool]:

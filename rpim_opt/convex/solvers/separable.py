@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.expressions import Evaluation, cp, evaluation, has, is_norm
+from rpim_opt.convex.expressions import Atom, Evaluation, cp, evaluation, has, is_norm
 from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, ReducedProgram, ReducedSquares, Unsolved
 
 DECREASE = 1e-12
@@ -443,8 +443,8 @@ class Loss:
 # --- the expression tree -----------------------------------------------------------------------------------------
 
 
-SUMS: dict[str, Any] = {"Sum": lambda a: a, "norm1": cp.abs, "quad_over_lin": cp.square}
-LARGEST: dict[str, Any] = {"max": lambda a: a, "sum_largest": lambda a: a, "norm_inf": cp.abs}
+SUMS: dict[str, Any] = {"Sum": lambda a: a, "norm1": Atom("abs"), "quad_over_lin": Atom("square")}
+LARGEST: dict[str, Any] = {"max": lambda a: a, "sum_largest": lambda a: a, "norm_inf": Atom("abs")}
 
 
 def _entries(e: Any, v: Any, atoms: dict[str, Any]) -> Any:
