@@ -415,9 +415,9 @@ def validate(
     In the table of --out, sigmas is a row's error over its predicted standard deviation; the largest of all rows
     exceeds allowed_sigmas with probability 0.01.
 
-    Exit code 1 if an error is above the limit, the errors are significantly larger than those of the nominal robot
-    (mean difference of their squares above three standard errors), or an input mistake is likely, a moved instrument
-    or base among them; 4 if none of these, but together the rows contradict the calibration (chi-squared by their
+    Exit code 1 if the calibration is not delivered, an error is above the limit, the errors are significantly larger
+    than those of the nominal robot (mean difference of their squares above three standard errors), or an input mistake
+    is likely, a moved instrument or base among them; 4 if none of these, but together the rows contradict the calibration (chi-squared by their
     predicted covariance, p-value below 0.01), as where the robot changed.
     """
     console.require_positive("--limit", limit)
@@ -428,7 +428,7 @@ def validate(
         limit = 1e3 * loaded.record.requirement.limit
     text, within = _against(limit, "error", validation.largest)
     document = {**validation.content(), "limit_mm": limit, "within_limit": within}
-    code = int(within is False or bool(validation.failure))
+    code = int(within is False or bool(validation.failure) or not loaded.verdict.delivered)
     if not code and validation.contradiction:
         code = CODES["inconclusive"]
     written = console.written_to(out, validation.csv())

@@ -313,6 +313,12 @@ def test_commands_follow_it(monkeypatch, capsys, tmp_path: Path) -> None:
     assert run(monkeypatch, *compensate, "--despite-verdict") == 0
     assert "despite the verdict" in capsys.readouterr().out
     assert run(monkeypatch, "accept", folder, "--limit", "500") == 1
+    data = result.problem.data
+    columns = [*(f"q{i}_rad" for i in range(1, 7)), "x_m", "y_m", "z_m"]
+    measured = np.hstack([data.q, data.blocks[0].y])
+    np.savetxt(tmp_path / "rows.csv", measured, delimiter=",", header=",".join(columns), comments="")
+    assert run(monkeypatch, "validate", folder, str(tmp_path / "rows.csv")) == 1  # the rows fit
+    assert "is not delivered" in capsys.readouterr().out
     assert run(monkeypatch, "report", folder) == 0
     assert "do not use this robot" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
