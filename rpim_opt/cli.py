@@ -417,8 +417,8 @@ def validate(
 
     Exit code 1 if the calibration is not delivered, an error is above the limit, the errors are significantly larger
     than those of the nominal robot (mean difference of their squares above three standard errors), or an input mistake
-    is likely, a moved instrument or base among them; 4 if none of these, but together the rows contradict the calibration (chi-squared by their
-    predicted covariance, p-value below 0.01), as where the robot changed.
+    is likely, a moved instrument or base among them; 4 if none of these, but together the rows contradict the
+    calibration (chi-squared by their predicted covariance, p-value below 0.01), as where the robot changed.
     """
     console.require_positive("--limit", limit)
     with _loaded(result) as (loaded, _):
