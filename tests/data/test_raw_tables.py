@@ -84,11 +84,11 @@ def test_dates_with_points_are_no_decimal_points(tmp_path: Path) -> None:
     assert "decimal commas" in found.notes[-1]
 
 
-def test_points_of_several_arrays_are_named_by_array_and_key(tmp_path: Path) -> None:
+def test_points_of_several_arrays_are_named_by_array_and_by_key_where_it_has_several(tmp_path: Path) -> None:
     homes = '<Data name="home"><Value key="0" j1="1"/></Data><Data name="cell"><Value key="0" x="7"/></Data>'
     path = write(tmp_path, homes + '<Data name="calib"><Value j1="2"/><Value j1="3"/></Data>', "raw.dtx")
     columns = read_raw(path).columns
-    assert list(columns["label"]) == ["home[0]", "calib[0]", "calib[1]"]
+    assert list(columns["label"]) == ["home", "calib[0]", "calib[1]"]
     assert list(columns["J1 [deg]"]) == ["1", "2", "3"]
 
 

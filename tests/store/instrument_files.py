@@ -463,6 +463,10 @@ STRANGERS: dict[str, Shape] = {
         ("p.dtx", lines('<Value j1="{1}" j2="{2}" j3="{3}" j4="{4}" j5="{5}" j6="{6}"/>\n')),
         ("points.csv", text([["Point", *HEAD[7:]]], [[str(i), *row] for i, row in enumerate(POINTS)])),
     ),
+    "VAL3, an array a point": many(
+        ("p.dtx", lines('<Data name="P{0}"><Value key="0" j1="{1}" j2="{2}" j3="{3}" j4="{4}" j5="{5}" j6="{6}"/></Data>\n')),
+        ("points.csv", text([["Point", *HEAD[7:]]], [[f"P{i}", *row] for i, row in enumerate(POINTS)])),
+    ),
     "a page of HTML, a group header above": one(
         "<html><body><h1>Report</h1><p>by: me<table border=1>\n<tr><th>Point<th colspan='6'>Joints [deg]<th colspan=\"3\">Measured [mm]\n<TR>"
         + "".join(f"<th>{name}" for name in ["", *joint_names("J{}"), *"XYZ"])

@@ -211,7 +211,8 @@ def _yaml_chain(data: bytes) -> tuple[Chain, dict[tuple[str, str], tuple[int, in
             if not match[2]:
                 joint = key
                 if key not in ("kinematics", *JOINTS):
-                    raise InputError(f"line {number}", f"'{key}'", choices(key, JOINTS))
+                    accepted = f"{choices(key, JOINTS)} (of Universal Robots; another DH table as .csv or .toml)"
+                    raise InputError(f"line {number}", f"'{key}'", accepted)
             elif key in SIX:
                 if joint not in JOINTS or (joint, key) in values:
                     raise InputError(f"line {number}", f"{joint}.{key} twice or out of place", "each joint once")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 
@@ -111,7 +112,10 @@ def read_yaskawa(text: str) -> Rows:
 
 
 def read_staubli(text: str) -> Rows:
-    """Return the points by their keys, numbered from 0 without keys; of several arrays as ``array[key]``."""
+    """Return the points by their keys, numbered from 0 without keys; of several arrays as ``array[key]`` or ``array``.
+
+    The latter of an array of one point.
+    """
     array, i = "", 0
     targets = []
     for element, fields in STAUBLI.findall(text):
@@ -123,9 +127,9 @@ def read_staubli(text: str) -> Rows:
             i += 1
     rows = _rows(targets)
     parts = [row["label"].rstrip("]").partition("[") for row in rows]
-    if len({array for array, _, _ in parts}) > 1:
-        return rows
-    return [{**row, "label": key} for row, (_, _, key) in zip(rows, parts, strict=True)]
+    sizes = Counter(array for array, _, _ in parts)
+    names = [key if len(sizes) == 1 else array if sizes[array] == 1 else f"{array}[{key}]" for array, _, key in parts]
+    return [{**row, "label": name} for row, name in zip(rows, names, strict=True)]
 
 
 FORMATS = (
