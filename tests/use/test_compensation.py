@@ -139,7 +139,7 @@ def test_orientation_is_corrected_where_it_is_known_better_than_nominally() -> N
     there = ro.use.compensate(result, q, poses)  # the nominal command is still that of the whole pose
     assert np.abs(there.nominal - q).max() < 1e-6
     sure, place = calibrated()[0], ro.use.compensate(calibrated()[0], q)
-    assert "determine only part of an orientation, the prior the rest" in place.point
+    assert "determine only part of an orientation; the prior determines the rest" in place.point
     assert rms(place.orientation_std) < rms(place.orientation_before)
     better = place.orientation_std < 0.9 * place.orientation_before
     assert 0 < np.count_nonzero(better) < 20
@@ -200,7 +200,7 @@ def test_poses_that_are_unreachable_name_the_option_by_which_position_alone_coun
     for poses, named in ((far, True), (np.array(far)[:, :3], False)):
         found = ro.use.compensate(result, poses=np.array(poses), despite_verdict=True)
         assert found.missed == ["1"]
-        assert ("and alone counts with --position-only." in str(found)) == named
+        assert ("with --position-only only the position is corrected." in str(found)) == named
 
 
 @pytest.mark.parametrize("name", ROBOTS)
