@@ -8,6 +8,7 @@ from itertools import chain
 from typing import Any, cast
 
 import numpy as np
+from scipy.special import fdtrc
 
 from rpim_opt.basics.arrays import TINY, Array, rms
 from rpim_opt.basics.exceptions import InputError, NotDelivered
@@ -34,7 +35,15 @@ from rpim_opt.problem.causes.positions import (
     single_rows,
     unrelated_rows,
 )
-from rpim_opt.problem.causes.residuals import MOVED, NOISY, NOTICED, SLIGHT, another_robot, shown_by_residuals
+from rpim_opt.problem.causes.residuals import (
+    MOVED,
+    NOISY,
+    NOTICED,
+    SLIGHT,
+    another_robot,
+    geared_otherwise,
+    shown_by_residuals,
+)
 from rpim_opt.problem.causes.rows import (
     ANGULAR,
     REACH,
@@ -78,11 +87,12 @@ MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), 
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
 UNUSUAL = {"length": 0.004, "angle": 0.05}
 """Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
-SCALED = 0.002  # common deviation of the longest link [m] from which a wrong scale is the likelier reason
-UNSCALED, MOST_SCALED = 0.005, 0.3
-"""Common deviation from which on no machined robot has it, and beyond which no scale is off, but a unit."""
+SCALED, BY_CHANCE = 0.001, 0.003
+"""Common deviation of the longest link [m] from which a wrong scale is the likelier reason, and its probability (F test
+against the other deviations of lengths)."""
+UNSCALED, SIGMAS = 0.005, 3.0  # that from which on no machined robot has it, also in stated standard deviations
+MOST_SCALED = 0.3  # beyond that no scale is off, but a unit
 LENGTHS = 3  # identified ones below which a common deviation is no more than that of each
-SIGMAS, COMMON = 3.0, 0.6  # standard deviations of it that chance does not make, and its least part of all deviations
 ALIKE = 0.045  # part of an effect on the data that others may leave where these do not distinguish them
 DEPENDENT = 1e-6  # singular value of effects, over the largest, below which they are combinations of the others
 TAKES_PART = 0.1  # part of the largest share in an effect from which on a frame parameter is named
@@ -167,8 +177,8 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     limited. Where the formulation limits the fit, other reasons than held-out rows follow from that, and are not named.
     """
     mapping = result.mapping.caution if result.mapping else ""
-    stretch = _stretch(result)
-    scaled = [_like_a_scale(result, stretch)] * (abs(stretch) > UNSCALED)
+    stretch, sigmas = _stretch(result)
+    scaled = [_like_a_scale(result, stretch)] * (abs(stretch) > UNSCALED and sigmas > SIGMAS)
     ambiguous = [] if scaled else [ambiguous_deviation(result)]
     conditions = (mapping, result.contradiction, *ambiguous, *_little_motion(result))
     caution = " ".join(filter(None, conditions))
@@ -197,7 +207,7 @@ def ambiguous_deviation(result: Outcome) -> str:
     worst = int(size.argmax())
     stated = _taking_part(result, worst) if result.problem.keeps_rows and size[worst] >= 1 else []
     if not stated:
-        return _like_a_scale(result, _stretch(result))
+        return _like_a_scale(result, _stretch(result)[0])
     return (
         f"{free.names[worst]} deviates by {in_unit(result.x[worst], free.dimensions[worst])}, which the data do not "
         f"distinguish from an error of the stated {joined(stated)}: check the stated value. If that is wrong, the "
@@ -226,23 +236,24 @@ def _little_motion(result: Outcome) -> Iterator[str]:
         )
 
 
-def _stretch(result: Outcome) -> float:
-    """Return the common deviation of a robot's lengths, as by the scale of what measured them; 0 for none."""
+def _stretch(result: Outcome) -> tuple[float, float]:
+    """Return the common deviation of lengths, as by a wrong scale, in stated standard deviations, too; 0 for none."""
     free, C = result.problem.parameters.free, result.known_covariance
     # of rows that do not fit, and of another robot, deviations say nothing
     if C is None or any(_residuals(result, kept_rows(result))) or any(_deviations(result)):
-        return 0.0
+        return 0.0, 0.0
     lengths = (np.array(free.dimensions) == "length") & ~free.of_frames & (free.nominal != 0) & np.isfinite(np.diag(C))
     if lengths.sum() < LENGTHS:
-        return 0.0
+        return 0.0, 0.0
     nominal, x = free.nominal[lengths], result.x[lengths]
     scale = free.scale if result.learned is None else result.learned.stated
     precision = np.linalg.inv(C[np.ix_(lengths, lengths)] + np.diag(scale[lengths] ** 2))  # of deviations found
     information = nominal @ precision @ nominal
     stretch = float(nominal @ precision @ x / information)
-    chance = max(SIGMAS**2, COMMON * float(x @ precision @ x))
-    seen = np.abs(stretch * nominal).max() >= SCALED and stretch**2 * information >= chance
-    return stretch * bool(seen and abs(stretch) <= MOST_SCALED)
+    gain = stretch**2 * information
+    others = max(float(x @ precision @ x) - gain, TINY) / (len(x) - 1)
+    seen = np.abs(stretch * nominal).max() >= SCALED and fdtrc(1, len(x) - 1, gain / others) < BY_CHANCE
+    return stretch * bool(seen and abs(stretch) <= MOST_SCALED), float(np.sqrt(gain))
 
 
 def _like_a_scale(result: Outcome, stretch: float) -> str:
@@ -364,11 +375,12 @@ def worse_than_nominal(nominal: Array, identified: Array, rows: str = "") -> str
 def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     """Say that residuals are beyond what instrument and robot make of them; of a camera in pixels and at the arm."""
     residuals = residual_rms(result, kept)
-    checked = _overdetermined(result) and not result.record.noise_assumed
+    checked = _overdetermined(result)
     for each, (size, ratio) in residuals.items():
         nominal = noise_ratio(result.problem, result.nominal_errors(dimension=each), each)  # with frames fitted
         small = 0 < min(ratio / OVERSTATED, NOISY * nominal) < 1  # 0: it was not measured
-        if checked and size > COMPUTED_RMS and small:
+        stated = each != "angle" or not result.record.noise_assumed  # that of orientations may be assumed far too large
+        if checked and stated and size > COMPUTED_RMS and small:
             yield f"Residuals are {ratio:.2g} times the stated noise, which is in another unit or far too large."
     for each, largest in {"length": REACH * arm_length(result.problem), "angle": ANGULAR}.items():
         size, ratio = residuals[each]
@@ -388,8 +400,15 @@ def _overdetermined(result: Outcome) -> bool:
 
 
 def _repeatability(result: Outcome) -> Iterator[str]:
-    """Say that what was taken for the robot's repeatability is beyond that of any robot."""
-    noise = {} if result.learned is None else result.learned.noise
+    """Say that what was taken for repeatability or transmission errors is beyond those of any robot."""
+    if result.learned is None:
+        return
+    noise, curves = result.learned.noise, result.learned.curves
+    if curves is not None and curves.size.value > LARGEST_CURVE:
+        yield (
+            f"Estimated transmission errors {three_digits(1e3 * curves.size.value)} mrad (1 sigma): no gear is worse "
+            f"than {1e3 * LARGEST_CURVE:g} mrad."
+        )
     for kind in (kind for kind in noise if kind in REPEATABILITY):
         size, (unit, largest) = noise[kind], REPEATABILITY[kind]
         dimension = "length" if kind == "position" else "angle"
@@ -819,7 +838,8 @@ def _in_place_of_extensions(result: Outcome, alone: CalibrationProblem) -> Itera
     bare = cast(CalibrationProblem, result.stated).on(alone.data)
     plain = min((trial.value for trial in learned.trials if not trial.extensions), default=np.inf)
     most = np.exp((min(trial.value for trial in learned.trials) - plain) / result.program.model.equations)
-    yield from shown_by_residuals(bare, ridge_deviations(bare), most=min(MOVED, float(most)))
+    x, most = ridge_deviations(bare), min(MOVED, float(most))
+    yield from first(shown_by_residuals(bare, x, most=most), geared_otherwise(bare, x, most))
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:

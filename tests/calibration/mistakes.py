@@ -357,7 +357,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     ),
     "axes that are not square": (
         values(lambda y: y + 2e-3 * np.outer(y[:, 1], [1, 0, 0])),
-        "of column y (that leaves",
+        "of column y (the residual RMS falls",
     ),
     "joints rounded to 0.1 degrees": (rounded(0.1), "rounded to 0.1 deg ("),
     "joints rounded to a degree": (rounded(1.0), "rounded to 1 deg ("),

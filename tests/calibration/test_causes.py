@@ -48,6 +48,7 @@ from tests.calibration.mistakes import (
     validated,
     values,
 )
+from tests.problem.test_global_start import HOBBY
 from tests.test_cli import run
 
 QUICK = {
@@ -451,7 +452,7 @@ def test_readings_that_scatter_are_named_before_what_they_make_uncertain(monkeyp
     made(monkeypatch, tmp_path, shaken, robot="ur3")
     capsys.readouterr()
     assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 4
-    said = r"Inconclusive: the readings scatter by 0.\d+ mm RMS, \d[\d.]* times the stated noise .* the median U over"
+    said = r"Inconclusive: readings scatter by 0.\d+ mm RMS, \d[\d.]* times the assumed noise .* the median U over"
     assert re.search(said, capsys.readouterr().out.replace("\n", " "))
 
 
@@ -793,13 +794,23 @@ def test_rows_in_which_the_reflector_was_loose_are_named() -> None:
     assert left_out | set(re.findall(r"P\d+", named[1])) == {f"P{i + 1}" for i in np.flatnonzero(slipped)}
 
 
+def test_a_gear_ratio_is_named_though_curves_take_it_up() -> None:
+    """A servo whose logger counts 3 % too much: 50 mrad at the ends of its range, which its slope alone misses."""
+    wrong = of_joint(2, lambda q: 1.03 * q)(simulated_arm(HOBBY, seed=2, count=40))
+    verdict = ro.calibrate(wrong, model="auto").verdict
+    assert any(
+        re.match(r"Likely: joint 3 .*turns -2.9 % more than its encoder reads", text) for text in verdict.reasons
+    )
+    assert "no gear is worse than 10 mrad" in str(verdict)
+
+
 def test_backlash_of_one_joint_is_that_of_no_second_one() -> None:
     """Which explains half of what is left by chance: 60 rows have 60 directions."""
     sides = 0.75e-3 * np.random.default_rng(5).choice([-1, 1], 60)
     problem = of_joint(1, lambda q: q + sides)(simulated_arm("irb120", count=60))
     problem = replace(problem, robots=replace(problem.robot, joint_names=tuple("ABCDEF")))
     (said,) = two_positions(problem, ro.calibrate(problem, ro.tikhonov, 1.0).x, 0.5)
-    assert said.startswith("backlash, joint 2 (B) by 1.5 mrad: one of two positions")
+    assert said.startswith("backlash, joint 2 (B) by 1.5 mrad: with one of two positions")
 
 
 @pytest.mark.parametrize(
@@ -817,7 +828,7 @@ def test_what_is_in_one_of_two_states_in_every_row_is_named(name: str, size: flo
     changed = np.random.default_rng(3).choice([False, True], 60)
     result = ro.calibrate(values(lambda y: y + apart * changed[:, None])(problem), model="auto")
     (said,) = result.verdict.reasons
-    assert f"another {state} (one of two in every row" in said
+    assert f"another {state} (with one of two in every row" in said
     named = [f"P{i + 1}" for i in np.flatnonzero(changed == (changed.sum() <= 30))]
     assert f"rows {', '.join(named[:3])}" in said
 

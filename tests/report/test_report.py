@@ -401,6 +401,19 @@ def test_a_robot_less_certain_than_the_nominal_one_errs_is_not_called_delivered(
     assert inconclusive(first, measured_workspace(first)) == ""
 
 
+@pytest.mark.parametrize(("repeats", "said"), [(1, "more than the repeatability of an industrial robot"), (2, "")])
+def test_readings_that_scatter_as_no_industrial_robot_does_are_inconclusive(repeats: int, said: str) -> None:
+    """As of a loose reflector; repeated ones show that the robot is so."""
+    problem = ro.load("position").problem
+    q, y = (np.repeat(values, repeats, axis=0) for values in (problem.data.q, problem.data.blocks[0].y))
+    loose = y + 4e-4 * np.random.default_rng(3).normal(size=y.shape)
+    result = ro.calibrate(problem.on(ro.Dataset.of(q, loose, 5e-5)))
+    assert result.verdict.delivered
+    text = inconclusive(result, measured_workspace(result))
+    assert said in text
+    assert bool(said) == bool(text)
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_outliers_that_were_excluded_automatically_are_in_the_table(tmp_path) -> None:
     result = ro.calibrate(ro.load("blunders").problem)

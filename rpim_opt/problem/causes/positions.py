@@ -31,6 +31,7 @@ from rpim_opt.robot.kinematics import forward_kinematics
 
 FAR_MOVED = 0.005
 """Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
+SINGLE = 1 / 3  # share of the rows up to which single ones have a joint value wrong
 UNLIKELY = 1e-3  # probability with which outliers may agree on one joint by chance
 UNRELATED = 0.25  # part of the spread of positions that a fit leaves where joint values do not explain them
 FOLDED = 0.1  # part of its largest value below which the smallest one of a column without signs is near zero
@@ -333,7 +334,7 @@ def other_rows(problem: CalibrationProblem) -> Iterator[str]:
             where = where or named_rows(problem.data, some.row, "fits if read otherwise:", "fit if read otherwise:")
             yield f"{where} {better.sentence}"
             return
-    if not together and not points.lengths and points.turns is None:
+    if not together and len(out) <= SINGLE * len(own) and not points.lengths and points.turns is None:
         yield from _turned_joint(problem, points.take(out), fit, FAR * float(np.median(fit.error[own])))
 
 

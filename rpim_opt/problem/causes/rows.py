@@ -32,6 +32,7 @@ MOST_DECIMALS = 4  # that are counted
 ON_GRID = 2e-4  # part of a step by which rounded values may miss it, for their last decimal
 ANOTHER = 0.01  # joint movement [rad, m] after which no point is measured again to the last digit
 FILLED = 1e-3  # a point that is at least so far from the one before [m] is another one
+STALE = 5e-3  # movement [m] at equal joint values that is no scatter: the arm was elsewhere
 COPIES = 0.2  # part of the rows that may repeat others
 TOGETHER, CHANCE_RUNS = 4, 0.05
 """Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
@@ -218,7 +219,7 @@ def filled_rows(data: Dataset) -> Iterator[str]:
                 f"{which} exactly half way between the points before and after: interpolated, not measured; leave out "
                 "what was filled in ([exclude])."
             )
-        again = (q[1:] == q[:-1]).all(axis=1) & (moves > FILLED)
+        again = (q[1:] == q[:-1]).all(axis=1) & (moves > STALE)
         if again.any():
             repeated = np.count_nonzero(again & ~np.append(False, again[:-1]))
             cause = "the log was not updated; leave such rows out ([exclude])."
