@@ -695,6 +695,8 @@ def _held(result: Outcome, problem: CalibrationProblem) -> Iterator[str]:
 
 def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: np.ndarray) -> Iterator[str]:
     """Say that loss, penalty or constraints leave what a squared penalty at weight 1 explains of the same rows."""
+    if result.record.earlier:  # whose prior is what was known
+        return
     if kept.mean() < 1 - EXCLUDED:  # downweighted by a fit that is wrong everywhere
         kept = np.ones_like(kept)
     rows, x = problem.on(problem.data.take(np.flatnonzero(kept))), result.x

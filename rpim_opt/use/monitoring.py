@@ -336,8 +336,8 @@ def _drift(
     # rows of one configuration were read together: the first of them has the time
     numbers, first = np.unique(problem.data.configuration, return_index=True)
     when = first[np.searchsorted(numbers, model.group)]
-    count = len(problem.data)
-    moments = np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(int)).tolist()
+    count, starts = len(problem.data), np.sort(first).tolist()
+    moments = np.unique(np.linspace(0, len(starts) - 1, min(len(starts), MOMENTS)).round().astype(int)).tolist()
     width = recalibration.prior_widths(result, framed) / free.scale
     readings = list(recalibration.readings(problem, model))
     equations = {cause.members: rows for cause, rows in readings}
@@ -368,11 +368,11 @@ def _drift(
                 bayes = recalibration.log_bayes_factor(*change, np.full(len(rows), recalibration.OUTLIER_WIDTH))
                 yield prior + bayes, Drift(misfit.evidence(cause, *change), int(when[rows[0]]), False, None)
                 continue
-            steps = [moved(cause, prior, start) for start in moments]
+            steps = [moved(cause, prior, starts[i]) for i in moments]
             yield from steps
             k = max(range(len(steps)), key=lambda k: steps[k][0])
             around = range(moments[max(k - 1, 0)] + 1, moments[min(k + 1, len(moments) - 1)])
-            yield from (moved(cause, prior, start) for start in around if start not in moments)
+            yield from (moved(cause, prior, starts[i]) for i in around if i not in moments)
             if count > 2:
                 yield moved(cause, prior, 0, True)
 

@@ -53,7 +53,8 @@ SPARED = 0.25  # part of the readings that may be wrong
 STRANGE = 5.0  # times the error before any calibration by which readings that no change explains are another robot's
 RIVAL, AS_GOOD = 0.05, 4.0  # probability, or what chi-squared falls less by, up to which another cause is named, too
 SHOWN = 5  # causes that are shown
-BASE = "base_"
+BASE, PLACE = "base_", 0.1
+"""Scale of a session's offset [m, rad] from which on it says nothing of where: then a new session is registered."""
 OF_ROBOT = ("robot_serial", "controller")  # details of a record that stay when the robot is measured again
 OF_EARLIER = " (of the earlier calibration)"  # of who measured, with what and when, where the new rows do not say it
 UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "  # What title and source of an updated calibration say.
@@ -249,8 +250,11 @@ def update(
     say("comparing with the previous calibration")
     elsewhere = ""
     base = tuple(name for name in free.names if name.startswith(registration(free, data)))
-    if not released:
+    wide = np.array(free.names)[prior_widths(result, problem) >= PLACE].tolist()
+    anew = tuple(name for name in wide if of_session(name) and name not in result.problem.parameters.free.names)
+    if not released and not anew:
         elsewhere, released = _base_elsewhere(result, problem, base, prior_inflation)
+    released += tuple(name for name in anew if name not in released)
     # a base that was reset may be anywhere: then it is registered again
     start = None if base and {*base} <= {*released} else previous_deviations(result, problem)
     changes: list[Cause] = []
@@ -283,9 +287,9 @@ def update(
     last = Earlier(
         result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],
         len(result.problem.labels), {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
-        prior_inflation, released, left_out,
+        prior_inflation, tuple(name for name in released if name not in anew), left_out,
     )  # fmt: skip
-    held_out = None if released else result.record.validation  # which was measured before a change
+    held_out = None if {*released} - {*anew} else result.record.validation  # which was measured before a change
     figures, said = _errors(result, updated, held_out)
     elsewhere = " ".join(filter(None, [elsewhere, said]))
     updated = replace(updated, record=_carried_on(result.record, last, source))

@@ -104,6 +104,24 @@ def test_a_step_among_ninety_checks_is_found_at_its_own(first: int) -> None:
     assert abs(drift.moved.change - 1e-3) < 4 * drift.moved.std
 
 
+def test_a_step_is_before_the_first_reading_of_its_configuration() -> None:
+    """Three reflectors are read in one configuration: a step before the second of them is one before the first."""
+    problem = simulated_arm("ur5e", count=50, markers=3)
+    p, data = problem.parameters, problem.data
+    slipped = np.where(np.array(p.free.names) == "theta3", 1e-3, 0.0)
+    moved = problem.modelled(slipped)
+    blocks = [
+        replace(block, y=block.y + np.where(np.arange(50)[:, None] >= 45, far - near, 0.0))
+        for block, far, near in zip(data.blocks, moved, problem.modelled(0 * slipped), strict=True)
+    ]
+    order = np.argsort(data.configuration, kind="stable")
+    result = ro.calibrate(problem.on(data.take(order[:120])), "tikhonov", 1.0)
+    checks = replace(data, blocks=tuple(blocks)).take(order[120:])
+    drift = ro.use.monitor(result, checks).drift
+    assert drift is not None
+    assert (drift.cause.name, checks.label[drift.first]) == ("theta3", checks.label[15])
+
+
 def test_a_slow_drift_is_no_step() -> None:
     found = ro.use.monitor(*checked(2, np.linspace(0, 1e-3, CHECKS)))
     assert found.drift is not None

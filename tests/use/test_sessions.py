@@ -122,6 +122,16 @@ def test_the_commands_that_judge_a_robot_judge_it_in_one_session(
     assert abs(stored - 1e3 * mapped.largest) < 1e-6 * stored
 
 
+def test_a_new_place_metres_away_is_no_change_of_the_robot(arm: ro.study.SimulatedArm, result: ro.Calibration) -> None:
+    """Session offsets of 1 m (1 sigma) leave its base open: their sum of squares counted against the robot."""
+    away = numeric_frame([7.0, -4.0, 1.5, 0.1, 0.2, 2.5])
+    y = arm.read.blocks[0].y[:30] @ away[:3, :3].T + away[:3, 3]
+    found = ro.use.update(result, ro.Dataset.of(arm.read.q[:30], y, NOISE, session=["away"] * 30))
+    assert not found.changes
+    assert found.before.likely
+    assert found.delivered
+
+
 def test_measurements_from_a_third_place_are_judged_by_the_robots_uncertainty_once_registered(
     arm: ro.study.SimulatedArm, result: ro.Calibration
 ) -> None:
