@@ -432,7 +432,8 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
     if any(map(of_session, result.problem.parameters.free.names)) and not result.problem.session:
         return (
             "Missing: one registration for all sessions, to the same reference points. U, at most "
-            f"{1e3 * bound:.3f} mm, includes session offsets, which more configurations do not reduce."
+            f"{1e3 * bound:.3f} mm, includes session offsets, which more configurations do not reduce; "
+            "`rpim_opt.use.in_session` gives the result in the frame of one session."
         )
     kinds = {b.measurement.name: b.measurement for part in result.problem.rows() for b in part.data.blocks}
     if not any(kind.registers for kind in kinds.values()):

@@ -71,10 +71,11 @@ def displacement(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str
         f"{1e3 * before:.3g} mm."
     )
     place = registration(result.problem.parameters.free, data)
+    again = f" --reset '{place}*'" * (place == "base_")  # a new session is registered by itself
     if far and after <= before / 2:
         return (
             f"{said} If the instrument or the base moved, use --register in `validate`, `monitor` and `accept`, or "
-            f"recalibrate by `update --reset '{place}*'`; do not add such rows to the problem's folder. If neither "
+            f"recalibrate by `update{again}`; do not add such rows to the problem's folder. If neither "
             "moved, the robot changed, and --register would hide that."
         ), ""
     if fdtrc(6, freedom, (squares - left) / 6 / (left / freedom)) < UNLIKELY:

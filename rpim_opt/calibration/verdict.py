@@ -87,9 +87,9 @@ MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), 
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
 UNUSUAL = {"length": 0.004, "angle": 0.05}
 """Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
-SCALED, BY_CHANCE = 0.001, 0.003
-"""Common deviation of the longest link [m] from which a wrong scale is the likelier reason, and its probability (F test
-against the other deviations of lengths)."""
+SCALED, BY_CHANCE, STATED = 0.001, 0.005, 3
+"""Common deviation of the longest link [m] from which a wrong scale is the likelier reason, and its probability: F test
+against the other deviations of lengths, and their stated scale as so many more."""
 UNSCALED, SIGMAS = 0.005, 3.0  # that from which on no machined robot has it, also in stated standard deviations
 MOST_SCALED = 0.3  # beyond that no scale is off, but a unit
 LENGTHS = 3  # identified ones below which a common deviation is no more than that of each
@@ -251,8 +251,9 @@ def _stretch(result: Outcome) -> tuple[float, float]:
     information = nominal @ precision @ nominal
     stretch = float(nominal @ precision @ x / information)
     gain = stretch**2 * information
-    others = max(float(x @ precision @ x) - gain, TINY) / (len(x) - 1)
-    seen = np.abs(stretch * nominal).max() >= SCALED and fdtrc(1, len(x) - 1, gain / others) < BY_CHANCE
+    freedom = len(x) - 1 + STATED
+    others = (float(x @ precision @ x) - gain + STATED) / freedom
+    seen = np.abs(stretch * nominal).max() >= SCALED and fdtrc(1, freedom, gain / others) < BY_CHANCE
     return stretch * bool(seen and abs(stretch) <= MOST_SCALED), float(np.sqrt(gain))
 
 
