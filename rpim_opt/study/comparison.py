@@ -30,6 +30,7 @@ MOST_DRAWS = 100_000  # each is a calibration of its own, and is listed before t
 TIE = 0.01  # errors that differ by no more than this part are a tie
 ENOUGH = 5  # problems from which on an interval speaks of problems like them; with fewer, of these
 CONFIDENCE = 0.95
+GROSS = 10.0  # largest held-out error over the mean one, from which on a reading is wrong
 SAME_DATA = ("problem", "split", "fold", "count", "seed")
 """Columns in which two replicates of a pair agree: then they saw the same data."""
 Pair = tuple[Any, ...]
@@ -421,6 +422,16 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         yield f"Intervals refer to {scope} (Student's t, {CONFIDENCE:.0%}); * excludes 1.{several}"
     elif len(standings) > 1:
         yield f"There are no intervals: fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one."
+    every_mean = figures(rows, "mean_mm")
+    gross = [
+        {pair for pair, error in of.items() if error > GROSS * every_mean.get(method, {}).get(pair, math.inf)}
+        for method, of in figures(rows, "max_mm").items()
+    ]
+    if gross and (common := set.intersection(*gross)):
+        yield (
+            f"In {counted(len(common), 'replicate')} one held-out error is more than {GROSS:g} times the mean one with "
+            "every method: the figures are those of gross readings. Exclude these ([exclude])."
+        )
     every = Counter(row["method"] for row in rows)
     without: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:

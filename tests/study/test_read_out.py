@@ -62,6 +62,12 @@ def test_replicates_that_are_not_delivered_are_counted() -> None:
     assert "b: not delivered, 6 of 6 replicates. Their figures are included; the column `reason` states why." in notes
 
 
+@pytest.mark.parametrize("largest", [5.0, 2.0])
+def test_held_out_readings_that_are_wrong_for_every_method_are_noted(largest: float) -> None:
+    found = compared({"a": even(1.0), "b": even(0.5)}, mean_mm=0.3, max_mm=largest)
+    assert any("gross readings" in note for note in found.summary().notes) == (largest > 3)
+
+
 def test_a_fit_that_no_robot_has_is_not_delivered() -> None:
     found = ro.compare("position", "tikhonov", ["reml", 1e9], splits=2, progress=False)
     assert [row["status"] for row in found.rows] == ["ok", "not delivered"] * 2
