@@ -58,7 +58,7 @@ COURSES = 6  # half waves that a slow motion has over all rows at most
 PLACES, PRECISE, SPANS = 40, 120, 12
 """Rows and joint values from which on something may have moved, and those between which it did and moved back."""
 MOST_EQUATIONS = 3000  # equations up to which a change is looked for
-GEAR_ROUNDS = 3  # fits with a gear ratio
+TURNED = 0.02  # movement of a joint [rad, m] from which on its slope says too little
 OUTLYING_ROUNDS = 3  # in which outliers of the one calibration are found
 
 
@@ -194,26 +194,27 @@ def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[st
 
 
 def geared_otherwise(problem: CalibrationProblem, x: Array, most: float) -> Iterator[str]:
-    """Say which gear ratio or coupling leaves at most a part of the squares at x (n,), if all is fitted anew with it.
+    """Say which gear ratio or coupling leaves at most a part of the squares at x (n,) where its slope says too little.
 
-    The slope of a ratio 3 % off says too little: the joint is 50 mrad off at its ends.
+    All is fitted anew with it: of a ratio 3 % off a joint is 50 mrad off at its ends.
     """
-    left, kind = rms(problem.errors(x)), slice(None)
-    first_one, total = None, np.zeros(1)
-    for _ in range(GEAR_ROUNDS):
-        model = problem.linearize(x)
-        gears = [each for each in _gears(problem, model) if each.geared][kind]
-        best = _explained(model, x, Equations.of(problem.data).angle, gears)
-        if best is None or best[1].geared is None:
-            break
-        number = next(i for i, each in enumerate(gears) if each is best[1])
-        first_one, kind = first_one or best[1], kind if first_one else slice(number, number + 1)
-        total += best[2]
-        problem = replace(problem, robots=replace(problem.robot, joint_map=best[1].geared(best[2])))
-        x = ridge_deviations(problem)
-    left = rms(problem.errors(x)) / max(left, TINY)
-    if first_one is not None and left**2 <= most:
-        yield from _said_of_addition((left, first_one, total))
+    model = problem.linearize(x)
+    best = _explained(model, x, Equations.of(problem.data).angle, _gears(problem, model))
+    if best is None or (geared := best[1].geared) is None:
+        return
+
+    def changed(factor: float) -> CalibrationProblem:
+        return replace(problem, robots=replace(problem.robot, joint_map=geared(np.array([factor]))))
+
+    def error(factor: float) -> float:
+        return rms(changed(factor).errors(ridge_deviations(changed(factor))))
+
+    ends = np.sort(best[2] * [0.8, 1.2])
+    found = scipy.optimize.minimize_scalar(error, bounds=ends, method="bounded", options={"xatol": 1e-3 * ends.std()})
+    left = found.fun / max(rms(problem.errors(x)), TINY)
+    turned = np.abs(changed(found.x).joint_values - problem.joint_values).max()
+    if left**2 <= most and turned > TURNED:
+        yield from _said_of_addition((left, best[1], np.array([found.x])))
 
 
 def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterator[Addition]:
