@@ -341,7 +341,7 @@ def _drift(
     width = recalibration.prior_widths(result, framed) / free.scale
     readings = list(recalibration.readings(problem, model))
     equations = {cause.members: rows for cause, rows in readings}
-    causes = [*recalibration.candidates(free, problem.data), *(cause for cause, _ in readings)]
+    causes = [*recalibration.candidates(framed), *(cause for cause, _ in readings)]
     priors = recalibration.log_priors(causes)
 
     def tried(kept: Array) -> Iterator[tuple[float, Drift]]:
@@ -387,5 +387,6 @@ def _drift(
         wrong.append(best.cause)
         kept[equations[best.cause.members]] = 0.0
     least = best.cause.gain - recalibration.AS_GOOD
-    others = dict.fromkeys(drift.cause.name for _, drift in found if drift.cause.gain > least)
-    return best._replace(others=tuple(name for name in others if name != best.cause.name)), tuple(wrong)
+    others = [drift.cause for _, drift in found if drift.cause.gain > least]  # but those that contain it
+    apart = dict.fromkeys(cause.name for cause in others if not {*cause.members} >= {*best.cause.members})
+    return best._replace(others=tuple(apart)), tuple(wrong)

@@ -160,6 +160,7 @@ class Update:
         # a frame that moved explains as much as the link before or behind it (base_z as d1), with more parameters
         found = [cause.gain - AS_GOOD for cause in self.changes[:1] if self.changed]
         rivals = [c for c in self.causes[1:] if c.probability > RIVAL or any(c.gain > least for least in found)]
+        rivals = [c for c in rivals if not any({*c.members} > {*cause.members} for cause in self.changes[:1])]
         if not (rivals and self.changes):
             return ""
         frames = [cause.name for cause in rivals if cause.kind == "frame"]
@@ -171,10 +172,11 @@ class Update:
 
     def __str__(self) -> str:
         count = f"{self.readings} readings"
+        besides = " besides that of what was reset" * bool(self.result.record.earlier[-1].released)
         verdicts = {
             "The robot has changed. With the previous calibration": self.changed,
             "The robot has not changed, but readings are wrong. With the previous calibration": bool(self.changes),
-            f"No change of the robot is detectable from {count}": self.before.likely,
+            f"No change of the robot{besides} is detectable from {count}": self.before.likely,
             f"{count} contradict the previous calibration": True,
         }
         verdict = next(text for text, holds in verdicts.items() if holds)
@@ -633,9 +635,12 @@ class Misfit:
         return cause._replace(gain=gain, p_value=Fit.of(gain, int(observed.sum()), self.noise_dof).probability)
 
 
-def candidates(free: Parameters, data: Dataset, reset: Sequence[str] = ()) -> list[Cause]:
-    """Return the candidate changes: parameters of the robot, frames and transmission errors as a whole; none reset."""
-    place = registration(free, data)
+def candidates(problem: Source, reset: Sequence[str] = ()) -> list[Cause]:
+    """Return the candidate changes: parameters of the robot, frames and transmission errors as a whole; none reset.
+
+    A motor that moves several joints shifts all their zeros.
+    """
+    free, place = problem.parameters.free, registration(problem.parameters.free, problem.sample().data)
     causes = []
     wholes: dict[tuple[str, str], list[str]] = {}
     for name, frame, curve in zip(free.names, free.of_frames, free.of_curves, strict=True):
@@ -647,6 +652,12 @@ def candidates(free: Parameters, data: Dataset, reset: Sequence[str] = ()) -> li
             wholes.setdefault((name.rpartition("_")[0], kind), []).append(name)
         else:
             causes.append(Cause(name, kind, (name,)))
+    for which, arm in problem.arms.items():
+        zeros = [("d" if kind == "prismatic" else "theta") + str(i) for i, kind in enumerate(arm.joint_types, 1)]
+        for motor, column in enumerate(arm.joint_map.T):
+            moved = [problem.parameters.called(which, zeros[k]) for k in np.flatnonzero(column)]
+            if len(moved) > 1 and {*moved} <= {*free.names} - {*reset}:
+                wholes[f"motor {arm.joint(motor)} ({joined(moved)})", "joint offset"] = moved
     return causes + [Cause(*whole, tuple(names)) for whole, names in wholes.items()]
 
 
@@ -669,7 +680,7 @@ def _weighed(
     misfit = Misfit(result, model, penalty_of(prior, len(x)), [free.names.index(name) for name in released])
     width = prior_widths(result, problem) / free.scale
     tried: list[tuple[Cause, tuple[Array, Array], Array]] = []  # with its change, and the widths of that
-    for cause in candidates(free, problem.data, released):
+    for cause in candidates(problem, released):
         index = [free.names.index(name) for name in cause.members]
         tried.append((cause, misfit.projected(slice(misfit.m, None), misfit.L[:, index]), width[index]))
     for cause, equations in readings(problem, model):

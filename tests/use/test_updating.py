@@ -77,6 +77,27 @@ def test_an_instrument_better_than_the_robot_repeats_is_no_formulation_that_limi
     assert found.delivered, str(found)
 
 
+def test_a_motor_that_moves_two_joints_shifts_both_zeros() -> None:
+    """As of a parallelogram: a length was blamed, and good readings were left out."""
+    robot = happened(6, theta2=3e-3, theta3=-3e-3)
+    lever = np.eye(6)
+    lever[2, 1] = -1.0
+    arm = replace(robot.problem.robot, joint_map=lever)
+    before, after = (
+        ro.Dataset.of(rows.q @ np.linalg.inv(lever).T, rows.blocks[0].y, SIGMA) for rows in (robot.before, robot.after)
+    )
+    first = ro.calibrate(replace(robot.problem, robots=arm).on(before))
+    found = ro.use.update(first, after)
+    (cause,) = found.changes
+    assert cause.members == ("theta2", "theta3")
+    assert "joint offset motor 2 (theta2 and theta3): " in str(found)
+    assert "do not distinguish" not in str(found)
+    for moved, size in zip(found.moved, (3e-3, -3e-3), strict=True):
+        assert abs(moved.change - size) < 4 * moved.std
+    reset = ro.use.update(first, after, reset=["theta?"])
+    assert str(reset).startswith("No change of the robot besides that of what was reset is detectable")
+
+
 @pytest.fixture(scope="module")
 def crashed() -> Robot:
     return happened(3, theta4=0.02)
