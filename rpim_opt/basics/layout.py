@@ -134,15 +134,14 @@ class RawTable:
     left: Sequence[Sequence[str]] = ()
 
     def with_constants(self, constants: Sequence[str]) -> RawTable:
-        """Return the table with columns of one value each, ``torso_lift [m]=0.15``."""
-        columns = dict(self.columns)
+        """Return the table with columns of one value each, ``torso_lift [m]=0.15``, unless it has one of that name."""
+        columns, own = dict(self.columns), {split(name)[0] for name in self.columns}
         for text in constants:
             name, mark, value = (part.strip() for part in text.rpartition("="))
             if not mark or math.isnan(numeral(value)):
                 raise InputError("constants", f"'{text}'", "COLUMN [UNIT]=NUMBER, such as 'torso_lift [m]=0.15'")
-            if name in columns:
-                raise InputError("constants", f"'{name}', which the table has", "a column that it lacks")
-            columns[name] = [value] * len(next(iter(columns.values()), ()))
+            if split(name)[0] not in own:
+                columns[name] = [value] * len(next(iter(columns.values()), ()))
         return replace(self, columns=columns)
 
 

@@ -105,6 +105,10 @@ def test_a_joint_that_nobody_recorded_is_stated(tmp_path: Path, monkeypatch: pyt
     instance = ro.load("cell")
     assert np.allclose(instance.problem.data.q, q, atol=1e-9)
     assert 'constants = "slide [m]=0.15"' in Path("cell/problem.toml").read_text()
+    moved = np.hstack([measured[:, :3], np.full((40, 1), 0.2)])  # a later table that has the joint: its values count
+    Path("joints.csv").write_text("id,turn [deg],slide2 [m],bend [deg],slide_m\n" + lines(moved))
+    assert run(monkeypatch, "new", "later", *folder[2:], "--constants", "slide [m]=0.15") == 0
+    assert np.allclose(ro.load("later").problem.data.q[:, 1], 0.2, atol=1e-9)
 
 
 def test_a_ready_robots_joint_by_the_name_of_its_driver_is_stated(
