@@ -803,7 +803,7 @@ def _without_outliers(
     errors, own = ordered.errors(result.x), np.isin(ordered.labels, list(kept))
     largest = np.nan_to_num(errors[own]).max()
     alone = ordered.on(ordered.data.take(np.flatnonzero(own | (errors <= largest))))
-    if not again or not result.single:
+    if not again or (result.squared_loss and not result.single):  # another loss may spread an outlier over all rows
         return alone, result.x
     x = ridge_deviations(alone)
     for _ in range(OUTLIER_SEARCHES):  # they hide behind each other, and make good rows look like outliers

@@ -389,8 +389,10 @@ class CalibrationProblem(RobotModel):
         Rows without such components get NaN. ``"pixel"``: what cameras are off [px]; their length is by how much the
         line of sight passes by the point. For touches the length is the distance from the mean of their point's
         touches, NaN for the only touch of a point. ``"stated length"`` and ``"stated angle"``: of what is known of
-        them, which is no measurement.
+        them, which is no measurement. InputError for another dimension.
         """
+        if not isinstance(dimension, str) or dimension.removeprefix("stated ") not in ("length", "angle", "pixel"):
+            raise InputError("dimension", f"{dimension!r}"[:40], "length, angle, pixel, stated length or stated angle")
         errors = np.full(len(self.data), np.nan)
         whole = self.residual(x)
         for block, index in zip(self.data.blocks, equation_numbers(self.data), strict=True):

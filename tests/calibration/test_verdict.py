@@ -387,6 +387,16 @@ def test_outliers_that_bias_a_loss_of_ones_own_are_named_and_not_the_formulation
         assert "residuals of rows c1, c7, c14, c39 and c43 are" in reason
 
 
+def test_an_outlier_that_a_loss_spreads_over_all_rows_is_the_cause() -> None:
+    """Of the largest errors of a minimax fit none stands out."""
+    problem = ro.load("position").problem
+    (block,) = problem.data.blocks
+    gross = block.y + 3e-3 * np.eye(len(block.y))[:, [3]]
+    result = ro.calibrate(problem.on(replace(problem.data, blocks=(replace(block, y=gross),))), ro.minimax, 0.1)
+    assert not result.verdict.delivered
+    assert f"outliers ({problem.labels[3]})" in str(result.verdict)
+
+
 def test_outliers_are_the_cause_where_the_same_rows_without_them_fit_a_loss_of_ones_own() -> None:
     """Its residuals with outliers were compared with those of a squared penalty without, and a weight was blamed."""
     lopsided = ro.Formulation("lopsided", lambda r: cp.sum_squares(cp.pos(r)) + 4 * cp.sum_squares(cp.neg(r)))
