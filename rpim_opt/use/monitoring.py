@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -344,16 +344,24 @@ def _drift(
     causes = [*recalibration.candidates(framed), *(cause for cause, _ in readings)]
     priors = recalibration.log_priors(causes)
 
-    def tried(kept: Array) -> Iterator[tuple[float, Drift]]:
-        """Yield explanations of the equations that are kept (m, 1), with logarithms of their probabilities."""
-        misfit = recalibration.Misfit(result, replace(model, A=model.A * kept, b=model.b * kept[:, 0]), form)
+    def columns(cause: recalibration.Cause, start: int, steady: bool) -> Array:
+        """Return the effect (m, c) of a change before a check, or steadily: of readings a part of the whole."""
+        course = when / (count - 1) if steady else when >= start
+        return A[:, [free.names.index(name) for name in cause.members]] * course[:, None]
+
+    def tried(kept: Array, beside: Array) -> Iterator[tuple[float, Drift]]:
+        """Yield explanations of the equations that are kept (m, 1), with logarithms of their probabilities.
+
+        Of single readings alone where another change has its columns (m, c) ``beside``.
+        """
+        whole = np.hstack([model.A, beside * np.sqrt(result.variance_factor)]) * kept
+        prior_form = replace(form, L=np.pad(form.matrix, ((0, 0), (0, beside.shape[1]))))
+        misfit = recalibration.Misfit(result, replace(model, A=whole, b=model.b * kept[:, 0]), prior_form)
 
         def moved(cause: recalibration.Cause, prior: float, start: int, steady: bool = False) -> tuple[float, Drift]:
-            """Return a change before a check, or steadily: while readings are taken by a part of the whole."""
             index = [free.names.index(name) for name in cause.members]
             scale = float(free.scale[index[0]])
-            course = when / (count - 1) if steady else when >= start
-            g, G = misfit.projected(slice(misfit.m), kept * A[:, index] * course[:, None])
+            g, G = misfit.projected(slice(misfit.m), kept * columns(cause, start, steady))
             amount = None
             if len(g) == 1 and G[0, 0] > 0:
                 change, std = scale * g[0] / G[0, 0], scale / np.sqrt(G[0, 0])
@@ -367,25 +375,37 @@ def _drift(
                 change = misfit.projected(rows, kept[rows] * np.eye(len(rows)))
                 bayes = recalibration.log_bayes_factor(*change, np.full(len(rows), recalibration.OUTLIER_WIDTH))
                 yield prior + bayes, Drift(misfit.evidence(cause, *change), int(when[rows[0]]), False, None)
-                continue
-            steps = [moved(cause, prior, starts[i]) for i in moments]
-            yield from steps
-            k = max(range(len(steps)), key=lambda k: steps[k][0])
-            around = range(moments[max(k - 1, 0)] + 1, moments[min(k + 1, len(moments) - 1)])
-            yield from (moved(cause, prior, starts[i]) for i in around if i not in moments)
-            if count > 2:
-                yield moved(cause, prior, 0, True)
+            elif not beside.size:
+                steps = [moved(cause, prior, starts[i]) for i in moments]
+                yield from steps
+                k = max(range(len(steps)), key=lambda k: steps[k][0])
+                around = range(moments[max(k - 1, 0)] + 1, moments[min(k + 1, len(moments) - 1)])
+                yield from (moved(cause, prior, starts[i]) for i in around if i not in moments)
+                if count > 2:
+                    yield moved(cause, prior, 0, True)
 
-    kept, wrong = np.ones((len(A), 1)), []
+    def likeliest(found: Iterable[tuple[float, Drift]]) -> Drift:
+        return max(found, key=lambda each: each[0])[1]  # as `update` has it: p-values favour few parameters
+
+    kept, nothing = np.ones((len(A), 1)), np.zeros((len(A), 0))
+    wrong: list[recalibration.Cause] = []
+    whole = list(tried(kept, nothing))
+    found = whole
     while True:
-        found = list(tried(kept))
-        best = max(found, key=lambda each: each[0])[1]  # as `update` has it: p-values favour few parameters
+        best = out = likeliest(found)
         if best.cause.p_value * len(found) >= level:
             return None, tuple(wrong)
-        if best.cause.kind != "reading" or len(wrong) >= recalibration.SPARED * count:
+        if best.cause.kind != "reading":  # beside which readings may be wrong, too
+            out = likeliest(tried(kept, columns(best.cause, best.first, best.steady)))
+        if out.cause.p_value * len(found) >= level:
             break
-        wrong.append(best.cause)
-        kept[equations[best.cause.members]] = 0.0
+        if len(wrong) >= recalibration.SPARED * count:  # of so many none is wrong by itself
+            wrong, found = [], [each for each in whole if each[1].cause.kind != "reading"]
+            best = likeliest(found)
+            break
+        wrong.append(out.cause)
+        kept[equations[out.cause.members]] = 0.0
+        found = list(tried(kept, nothing))
     least = best.cause.gain - recalibration.AS_GOOD
     others = [drift.cause for _, drift in found if drift.cause.gain > least]  # but those that contain it
     apart = dict.fromkeys(cause.name for cause in others if not {*cause.members} >= {*best.cause.members})

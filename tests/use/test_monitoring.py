@@ -104,6 +104,17 @@ def test_a_step_among_ninety_checks_is_found_at_its_own(first: int) -> None:
     assert abs(drift.moved.change - 1e-3) < 4 * drift.moved.std
 
 
+def test_a_wrong_check_beside_a_change_is_named_and_raises_no_alarm_of_its_own() -> None:
+    result, data = checked(1, np.where(np.arange(CHECKS) >= 12, 3e-3, 0.0))
+    (block,) = data.blocks
+    found = ro.use.monitor(
+        result, replace(data, blocks=(replace(block, y=block.y + 1e-3 * np.eye(CHECKS)[:, [4, 4, 4]]),))
+    )
+    assert [cause.members for cause in found.wrong] == [(data.label[4],)]
+    assert found.drift is not None
+    assert (found.drift.cause.name, found.drift.first, found.since) == ("theta3", 12, 12)
+
+
 def test_a_step_is_before_the_first_reading_of_its_configuration() -> None:
     """Three reflectors are read in one configuration: a step before the second of them is one before the first."""
     problem = simulated_arm("ur5e", count=50, markers=3)
