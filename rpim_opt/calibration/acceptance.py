@@ -11,7 +11,7 @@ from scipy.special import bdtrc, fdtri
 
 from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import joined, listed, percent, three_digits
+from rpim_opt.basics.text import joined, listed, percent
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.diagnosis import SLACK
@@ -29,18 +29,10 @@ from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors
-from rpim_opt.calibration.verdict import (
-    Verdict,
-    ambiguous_deviation,
-    arm_length,
-    kept_rows,
-    refuse_misread,
-    residual_rms,
-)
+from rpim_opt.calibration.verdict import Verdict, ambiguous_deviation, kept_rows, refuse_misread, scatter
 from rpim_opt.calibration.words import VAGUE, underdetermined
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut, Requirement
-from rpim_opt.problem.causes.residuals import NOISY
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import in_base, markers, within
 from rpim_opt.robot.parameters import of_session
@@ -53,8 +45,6 @@ STATED = 1e9  # degrees of freedom of an uncertainty that is stated
 WORST, BESIDE = 16, 16  # the search for the largest bound goes on from so many, at so many beside each
 STEPS = (0.1, 0.05, 0.025, 0.0125)  # how far beside, as fractions of the joint ranges
 LEAST = 1e-9  # width of the range of a joint that never moved [rad or m]
-REPEATABLE = 2e-4
-"""Part of an arm's length up to which industrial robots repeat: data sheets state 0.02 to 0.1 mm a metre."""
 ANYWHERE = Requirement(limit=1.0)  # the region of a result without requirement: joints within the measured ranges
 
 
@@ -232,31 +222,15 @@ def tested(result: Calibration) -> tuple[Acceptance | None, Workspace | None]:
 
 
 def inconclusive(result: Calibration, found: Workspace | None) -> str:
-    """Return a warning if U exceeds the error of the nominal robot, or residuals any industrial robot's repeatability.
-
-    Readings that scatter are a robot's repeatability only where repeated ones show it; otherwise an empty text.
-    """
+    """Return a warning if U exceeds the error of the nominal robot, or readings scatter; otherwise an empty text."""
     if not (of_positions(result) and result.verdict.delivered):
         return ""
+    if scatter(result, kept_rows(result)):
+        return "Inconclusive: check the condition below before using this robot."
     name, errors, _ = headline_errors(result)
     nominal = rms(errors)
-    size, ratio = residual_rms(result, kept_rows(result))["length"]
-    most = REPEATABLE * arm_length(result.problem)
-    scatter = ""
-    if ratio > NOISY:
-        noise = "assumed" if result.record.noise_assumed else "stated"
-        scatter = (
-            f"readings scatter by {three_digits(1e3 * size)} mm RMS, {three_digits(ratio)} times the {noise} noise "
-            "(did the arm vibrate, or something shake the instrument? Is the reflector, tool or base loose?)"
-        )
     if found is None or found.median <= nominal:
-        fit = judged(result) if scatter and size > most else None
-        if fit is None or fit.repeated is not None:
-            return ""
-        return (
-            f"Inconclusive: {scatter}, more than the repeatability of an industrial robot of this size "
-            f"({three_digits(1e3 * most)} mm). Repeat five configurations, and state the instrument's noise ([noise])."
-        )
+        return ""
     advice = (
         "Measure more configurations (`rpim-opt design --augment`), with larger wrist rotations, or state what is "
         'known of the reflector ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]).'
@@ -264,8 +238,8 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
     if any(map(of_session, result.problem.parameters.free.names)) and not result.problem.session:
         advice = _missing(result, nominal, found, 0.0)
     return (
-        f"Inconclusive: {f'{scatter}, and ' * bool(scatter)}the median U over the region, {1e3 * found.median:.3f} mm, "
-        f"is above the error of the nominal robot, {1e3 * nominal:.3f} mm RMS on the {name} rows. {advice}"
+        f"Inconclusive: the median U over the region, {1e3 * found.median:.3f} mm, is above the error of the "
+        f"nominal robot, {1e3 * nominal:.3f} mm RMS on the {name} rows. {advice}"
     )
 
 

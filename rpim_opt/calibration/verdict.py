@@ -46,6 +46,7 @@ from rpim_opt.problem.causes.residuals import (
 )
 from rpim_opt.problem.causes.rows import (
     ANGULAR,
+    FEWEST,
     REACH,
     all_q,
     beyond_limits,
@@ -69,7 +70,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
 from rpim_opt.problem.registration.points import of_sessions
-from rpim_opt.problem.row_functions import measured_torques
+from rpim_opt.problem.row_functions import measured_torques, repeated
 from rpim_opt.robot.mdh import MDH, Robot, numbered
 from rpim_opt.robot.parameters import frame_of, own_name
 
@@ -97,6 +98,7 @@ ALIKE = 0.045  # part of an effect on the data that others may leave where these
 DEPENDENT = 1e-6  # singular value of effects, over the largest, below which they are combinations of the others
 TAKES_PART = 0.1  # part of the largest share in an effect from which on a frame parameter is named
 WIDE = 1e4  # prior standard deviations of what has no penalty
+REPEATABLE = 2e-4  # part of an arm's length up to which industrial robots repeat: data sheets state 0.02 to 0.1 mm
 EXCLUDED = 0.25  # share of the rows that may be outliers
 COMPUTED, COMPUTED_RMS = 0.05, 2e-5  # nominal RMS over the stated noise, and itself [m], of computed positions
 ROUNDED = 1.1  # nominal RMS over what rounding of the measured values makes, below which they were computed, too
@@ -125,7 +127,8 @@ class Verdict:
     Exit codes, exports, compensation and the report follow it. ``reasons`` say why it is not delivered, a sentence
     each; empty where it is. ``caution`` is the condition that it depends on and that uncertainties do not contain:
     signs and zeros of joints that were estimated, constraints that the data contradict, a stated frame whose error
-    would look like a large deviation of the robot, joints that hardly moved; empty where there is none.
+    would look like a large deviation of the robot, joints that hardly moved, readings that scatter; empty where there
+    is none.
 
     >>> import rpim_opt as ro
     >>> print(ro.calibrate(ro.load("position").problem, "tikhonov", 1.0, max_iterations=1).verdict)
@@ -180,19 +183,21 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     stretch, sigmas = _stretch(result)
     scaled = [_like_a_scale(result, stretch)] * (abs(stretch) > UNSCALED and sigmas > SIGMAS)
     ambiguous = [] if scaled else [ambiguous_deviation(result)]
+    kept = kept_rows(result)
     conditions = (mapping, result.contradiction, *ambiguous, *_little_motion(result))
     caution = " ".join(filter(None, conditions))
     limited = tuple(text for text in causes if LIMITED in text)
     if limited:
         return Verdict((*limited, *_worse(result)), caution)
     reasons = [] if result.converged else [result.message]
-    kept = kept_rows(result)
     reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result, bool(causes)), *scaled]
     out = {*np.array(result.problem.labels)[~kept].tolist(), *(row.label for row in result.left_out)}
     rows = len(out.union(result.problem.labels))
     if len(out) > EXCLUDED * rows:
         reasons.append(f"{len(out)} of {rows} rows are outliers, more than {EXCLUDED:.0%}.")
     reasons += [*_worse(result), *_computed(result), *causes]
+    if not reasons:
+        caution = " ".join(filter(None, (caution, scatter(result, kept))))
     return Verdict(tuple(dict.fromkeys(reasons)), caution)
 
 
@@ -212,6 +217,21 @@ def ambiguous_deviation(result: Outcome) -> str:
         f"{free.names[worst]} deviates by {in_unit(result.x[worst], free.dimensions[worst])}, which the data do not "
         f"distinguish from an error of the stated {joined(stated)}: check the stated value. If that is wrong, the "
         "identified parameters are valid only in combination with it."
+    )
+
+
+def scatter(result: Outcome, kept: np.ndarray) -> str:
+    """Return a sentence if rows, kept (N,), scatter as no industrial robot does; unless repeated ones show it does."""
+    size, ratio = residual_rms(result, kept)["length"]
+    most = REPEATABLE * arm_length(result.problem)
+    blocks = result.problem.sample().data.blocks
+    if ratio <= NOISY or size <= most or sum(len(block.row) - repeated(block).max() - 1 for block in blocks) >= FEWEST:
+        return ""
+    noise = f"{three_digits(ratio)} times the {'assumed' if result.record.noise_assumed else 'stated'} noise"
+    return (
+        f"Readings scatter by {three_digits(1e3 * size)} mm RMS, {noise} and more than industrial robots of this size "
+        f"({three_digits(1e3 * most)} mm): did the arm vibrate, or something shake the instrument? Is the reflector, "
+        "tool or base loose? Repeat five configurations, and state the instrument's noise ([noise])."
     )
 
 

@@ -191,9 +191,12 @@ class Update:
         if self.changes:
             lines.append(f"After these changes: {self.after}.")
         if self.undetermined:
+            omit = ", or omit --reset if nothing was moved" * bool(
+                {*self.undetermined} - {c.name for c in self.changes}
+            )
             lines.append(
                 f"The new rows do not determine {joined(self.undetermined)}: measure more configurations, at least "
-                "three with the reflector's positions not on a line, or omit --reset if nothing was moved."
+                f"three with the reflector's positions not on a line{omit}."
             )
         for name, of in self.errors.items():
             was, now = (f"{of[when]['rms_mm']:.4f} mm" for when in ("before", "after"))
