@@ -11,7 +11,7 @@ from scipy.special import chdtrc, chdtri, fdtrc, pdtrc
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.quadratic import Quadratic, ridge
 from rpim_opt.convex.robust_loss import RARE, kept_equations
-from rpim_opt.data.dataset import Block
+from rpim_opt.data.dataset import Block, stops
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.noise import Equations
@@ -155,7 +155,7 @@ def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.nda
     whose = np.array(problem.data.robot)
     together = problem.data.configuration
     if problem.touches is not None:  # touches of a point have one number, and differ in their joint values
-        together = np.unique(q, axis=0, return_inverse=True)[1].ravel()
+        together = stops(q)
     for k, i in enumerate(rows):
         apart = np.sum((unit - unit[i]) ** 2, axis=1)
         apart[(together == together[i]) | (whose != whose[i])] = np.inf
@@ -170,8 +170,8 @@ def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.nda
 
 def coherent(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndarray:
     """Return which rows (r,) are no outliers: with errors like their neighbours in joint space, or a run in time."""
-    q = problem.data.q
-    visit = np.cumsum(np.any(np.diff(q, axis=0, prepend=q[:1]) != 0, axis=1))  # of the same joint values
+    stop = stops(problem.data.q)
+    visit = np.cumsum(np.diff(stop, prepend=stop[:1]) != 0)
     suspect = np.zeros(visit[-1] + 1, dtype=bool)
     suspect[visit[rows]] = True
     share = suspect.mean()

@@ -413,9 +413,9 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
     if not any(kind.registers for kind in kinds.values()):
         return (
             f"Missing: the base frame, which {joined(list(kinds))} readings do not determine: more of them hardly "
-            f"reduce U, at most {1e3 * bound:.3f} mm. Measure from three anchors or more (column `fixture`), or state "
-            "what a survey or the data sheet says of the anchor, the cable's length and the first link in [prior] "
-            '(known = ["anchor_x = 900 +- 0.05 mm", ...]).'
+            f"reduce U, at most {1e3 * bound:.3f} mm. State in [prior] what a survey or the data sheet says of the first "
+            'link, which places the base (known = ["theta1 = 0 +- 0.001 deg", ...] for its alpha, a, theta and d), or of '
+            "all anchors."
         )
     measured = reached_positions(result, found.region, _measured(result), found.requirement.confidence)[1].max()
     apart = ""

@@ -19,6 +19,8 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import from_matrices, pose, position
 from rpim_opt.robot.parameters import session_prefix
 
+STILL = 1e-4  # [rad, m] by which joint values of an arm at rest scatter at most; no two poses are so near on purpose
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Block(Brief):
@@ -243,7 +245,7 @@ class Dataset(Tabled):
         marker: Sequence[Any] | np.ndarray = (),
         fixture: Sequence[str] | np.ndarray = (),
     ) -> Dataset:
-        """Return a dataset from arrays; rows of equal joint values are one configuration.
+        """Return a dataset from arrays; rows in which the arm stood still are one configuration (`stops`).
 
         ``q`` (N, dof) are joint values of the controller [rad or m], (N, p, dof) where a row involves p points; ``y``
         (N, c) are measured values [SI], poses also as transforms (N, 4, 4). ``sigma`` is the standard deviation [SI] of
@@ -307,8 +309,7 @@ class Dataset(Tabled):
             blocks = whole.by_place(_names(marker, "marker", N, points), _names(fixture, "fixture", N))
         else:
             blocks = (whole,)
-        _, at, own = np.unique(q.reshape(N, -1), axis=0, return_index=True, return_inverse=True)
-        configuration = np.argsort(np.argsort(at))[own.reshape(-1)]  # in the order of their first rows
+        configuration = _numbered(stops(q).tolist())
         labels = _names(label, "label", N)
         return cls(blocks, tuple(str(i + 1) for i in range(N)) if labels is None else tuple(labels), configuration)
 
@@ -316,14 +317,27 @@ class Dataset(Tabled):
     def together(cls, parts: Sequence[Dataset], names: Sequence[str]) -> Dataset:
         """Return several datasets of a robot as one (`concatenated`); equal joint values are one configuration."""
         whole = cls.concatenated(parts, names)
-        stop = np.unique(whole.q, axis=0, return_inverse=True)[1].reshape(-1)
-        return replace(whole, configuration=_united(whole.configuration, np.arange(len(whole)), stop))
+        return replace(whole, configuration=_united(whole.configuration, np.arange(len(whole)), stops(whole.q)))
 
 
 def _numbered(keys: Iterable[Any]) -> np.ndarray:
     """Return numbers (N,) from 0 of N keys, the same of equal ones, in the order of their first."""
     number: dict[Any, int] = {}
     return np.array([number.setdefault(key, len(number)) for key in keys], dtype=int)
+
+
+def stops(q: Array) -> np.ndarray:
+    """Return numbers (N,) of joint values (N, ...) [rad or m], one for all rows of equal ones.
+
+    Consecutive rows that differ from the first of them by no more than encoders scatter are of one stop as well.
+    """
+    q = q.reshape(len(q), -1)
+    first, moved = 0, np.ones(len(q), dtype=bool)
+    for i in np.flatnonzero((np.abs(np.diff(q, axis=0)) <= 2 * STILL).all(axis=1)) + 1:
+        first = i - 1 if moved[i - 1] else first
+        moved[i] = (np.abs(q[i] - q[first]) > STILL).any()
+    equal = np.unique(q, axis=0, return_inverse=True)[1]
+    return _united(np.asarray(equal).reshape(-1), np.arange(len(q)), np.cumsum(moved))
 
 
 def _united(group: np.ndarray, rows: np.ndarray, keys: np.ndarray) -> np.ndarray:

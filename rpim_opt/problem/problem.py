@@ -14,7 +14,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.text import Tabled, counted
-from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.dataset import Block, Dataset, stops
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.pose import position
 from rpim_opt.problem.contact import Features, Touches, contrasted, of_rows
@@ -463,11 +463,16 @@ class CalibrationProblem(RobotModel):
         return np.asarray(self.data.configuration[self.owners])
 
     @cached_property
+    def equations(self) -> Equations:
+        """The equations of `linearize`, (m,): without those that place the touched points."""
+        if self.touches is None:
+            return self._equations
+        return Equations(*(each[self.touches.kept] for each in self._equations))
+
+    @property
     def owners(self) -> np.ndarray:
         """Number of the row that every equation of `linearize` belongs to, (m,)."""
-        if self.touches is None:
-            return self._equations.row
-        return self._equations.row[self.touches.kept]
+        return self.equations.row
 
     # Touched points and planes
 
@@ -521,8 +526,7 @@ class CalibrationProblem(RobotModel):
         stacks = self._stacked(self._equations.grouped(self.data.configuration[self._equations.row]), joints, at)
         if self.touches is None:
             return stacks
-        stop = np.unique(self.data.q, axis=0, return_inverse=True)[1].ravel()
-        return contrasted(self.touches, stacks, stop[self._equations.row])
+        return contrasted(self.touches, stacks, stops(self.data.q)[self._equations.row])
 
     def _stacked(self, groups: Iterable[np.ndarray], joints: bool, at: Array | None) -> list[Stack]:
         """Return groups of equations (N, k) with the components of their noise; arguments as for `stacks`."""

@@ -18,8 +18,9 @@ from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.problem.causes import misreadings
 from rpim_opt.problem.causes.misreadings import better_interpretation
 from rpim_opt.problem.causes.positions import odd_column, other_rows
-from rpim_opt.problem.causes.residuals import two_positions
+from rpim_opt.problem.causes.residuals import scattered_rows, two_positions
 from rpim_opt.problem.causes.rows import left_out_together, rows_without_values
+from rpim_opt.problem.registration.frames import ridge_deviations
 from rpim_opt.robot import read_robot
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.library import READY
@@ -794,6 +795,35 @@ def test_rows_in_which_the_reflector_was_loose_are_named() -> None:
     assert result.learned
     left_out = {row.label for row in result.learned.left_out}  # of which there were too many
     assert left_out | set(re.findall(r"P\d+", named[1])) == {f"P{i + 1}" for i in np.flatnonzero(slipped)}
+
+
+@pytest.mark.parametrize("name", ["cable", "distance"])
+def test_rows_that_all_scatter_alike_are_of_one_kind(name: str) -> None:
+    """Seven times as much as is stated, or only some of them; the larger half of any sample scatters more."""
+    problem = ro.load(name).problem
+    clean = problem.modelled(np.zeros(len(problem.parameters.free)))
+    alike, apart, right = 0, 0, []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        loose = rng.random(len(problem.data)) < 0.3
+        for some in (np.ones(len(loose), dtype=bool), loose):
+            size = np.where(some, 7.0, 1.0) * rng.normal(size=len(loose))
+            blocks = [
+                replace(block, y=y + np.sqrt(block.covariance[:, :, 0]) * size[block.row, None])
+                for block, y in zip(problem.data.blocks, clean, strict=True)
+            ]
+            noisy = problem.on(replace(problem.data, blocks=tuple(blocks)))
+            said = list(scattered_rows(noisy, ridge_deviations(noisy)))
+            if some.all():
+                alike += bool(said)
+            elif said:
+                apart += 1
+                rows = set(re.split(", | and ", said[0].split("rows ")[1].split(" are ")[0]))
+                named = np.isin(noisy.labels, list(rows))
+                right.append(np.mean(loose[named]))
+    assert alike == 0
+    assert apart >= 7
+    assert np.mean(right) > 0.9
 
 
 def test_a_gear_ratio_is_named_though_curves_take_it_up() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.problem.causes.residuals import shown_by_residuals
+from rpim_opt.problem.registration.frames import ridge_deviations
 from rpim_opt.report import write_report
 from rpim_opt.store.instances import UNSTATED
 from rpim_opt.study.studies import load_study
@@ -142,3 +145,15 @@ def test_errors_of_touches_are_told_point_by_point(problem: str, tmp_path: Path)
     page = (tmp_path / "report.html").read_text()
     assert "Validation, distance of touches" in page
     assert "Error of a touch" in page
+
+
+@pytest.mark.parametrize("name", ["contact", "datum_cube"])
+def test_touches_of_which_too_little_noise_is_stated_show_no_mistake(name: str) -> None:
+    """The equations that place touched points were taken for those of rows, and all others for rows that scatter."""
+    problem = ro.load(name).problem
+    data = problem.data
+    known = [np.array(data.label)[block.row] for block in data.blocks if not block.measurement.touching]
+    finer = [replace(block, covariance=1e-2 * block.covariance) for block in data.blocks]
+    every = problem.on(replace(data, blocks=tuple(finer)))
+    for some in (every, every.without(set(np.concatenate(known)))):
+        assert list(shown_by_residuals(some, ridge_deviations(some))) == []

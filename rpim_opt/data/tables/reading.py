@@ -14,7 +14,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError, choices, in_file
 from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
 from rpim_opt.basics.units import LARGEST, SMALLEST, Unit, quantities, split_unit, with_unit
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import Dataset, stops
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import position
 from rpim_opt.robot.mdh import Robot
@@ -36,7 +36,8 @@ def read_data(
 
     Every column's name carries its unit: ``label, q1_deg, ..., x_mm, y_mm, z_mm``. Optional columns are
 
-    - ``label``; ``configuration`` (rows of one stay together; rows with equal joint values by default);
+    - ``label``; ``configuration`` (rows of one stay together; rows with equal joint values by default, and
+      consecutive ones in which the arm stood still);
     - ``marker`` (which reflector); ``fixture`` (which anchor, plane or sphere); ``point``
       or ``plane`` (which one was touched); ``session`` (any text: rows of one share an error of the registration);
     - ``sigma_mm``, ``sigma_x_mm`` (standard deviations of a row, of one component), ``u95_mm``, ``u95_x_mm``
@@ -96,9 +97,11 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     marker = np.column_stack(markers) if {"marker", "to_marker"} & set(table) else ()
     stated |= {"marker": marker, "fixture": texts(table.get("fixture", ()), "fixture")}
     data = Dataset.of(q, y, noise, label, kind, columns=further, session=session, point=point, **stated)
-    # as stated, or rows of equal joint values are one
-    stops = np.array(texts(table["configuration"], "configuration")) if "configuration" in table else q.reshape(N, -1)
-    data = replace(data, configuration=np.unique(stops, axis=0, return_inverse=True)[1].reshape(-1))
+    if "configuration" in table:
+        stop = np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
+    else:
+        stop = stops(q)
+    data = replace(data, configuration=stop)
     return data.grouped_by_points() if kind.touching else data
 
 

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from scipy.special import fdtrc
+from scipy.special import fdtrc, gammaln
 
 from rpim_opt.basics.arrays import TINY, Array, rms
 from rpim_opt.basics.text import joined, listed, three_digits
@@ -31,7 +31,6 @@ from rpim_opt.problem.causes.rows import (
     stretched_length,
 )
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import SHIFTED, CalibrationProblem
 from rpim_opt.problem.registration.frames import ridge_deviations
 from rpim_opt.problem.registration.points import fit_points, points_of
@@ -52,6 +51,8 @@ LOADS, SINGULAR = 0.6, 1e-9
 TWO_KINDS, STARTS = 0.4, 30
 """Rows are of two kinds if two calibrations leave less than this part of the residuals of one; starts of the search."""
 SCATTERED = 5.0  # residuals of rows over those of the others from which on they are of another kind
+NORMAL, HEAVY, LIKELIER = 1e3, 3.0, 7.0
+"""Degrees of freedom of Student's distributions of all rows; log odds at which some are of another kind (1,000:1)."""
 JUMPING = 0.5  # mean square step of every joint over that of rows in random order, above which rows have no order
 BENDS = 4  # degree of the polynomial that the side of a rail is
 COURSES = 6  # half waves that a slow motion has over all rows at most
@@ -156,9 +157,7 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
     acceptable = min(max(of_noise, min(own, default=0.0)), 1.0)
     most = min(MOVED if most is None else most, acceptable**2)
     moves = _moves(problem, x, along_joints=most <= MOVED)
-    angle = Equations.of(problem.data).angle
-    if problem.touches:  # lengths, without those that place the touched points
-        angle = np.zeros(len(model.A), dtype=bool)
+    angle = problem.equations.angle
     best = _explained(model, x, angle, chain(moves, _gears(problem, model), _scales(problem, x, model)), most)
     left, limit = np.inf if best is None else best[0], min(TWO_KINDS, acceptable)
     if single:
@@ -199,7 +198,7 @@ def geared_otherwise(problem: CalibrationProblem, x: Array, most: float) -> Iter
     All is fitted anew with it: of a ratio 3 % off a joint is 50 mrad off at its ends.
     """
     model = problem.linearize(x)
-    best = _explained(model, x, Equations.of(problem.data).angle, _gears(problem, model))
+    best = _explained(model, x, problem.equations.angle, _gears(problem, model))
     if best is None or (geared := best[1].geared) is None:
         return
 
@@ -349,11 +348,12 @@ def _changes(
     some = np.flatnonzero(np.isin(free.names, list(names)))
     if not len(some):
         return
-    equations = Equations.of(problem.data)
+    equations = problem.equations
 
     def say(when: str, share: Array, coefficients: Array) -> tuple[str, str]:
         rows = equations.length & share.any(axis=1)
-        by_share = problem.jacobian(x)[np.ix_(rows, some)] * free.scale[some] @ coefficients.reshape(len(some), -1)
+        slopes = problem.contrasts(problem.jacobian(x))[np.ix_(rows, some)] * free.scale[some]
+        by_share = slopes @ coefficients.reshape(len(some), -1)
         change = np.sum(by_share * share[rows], axis=1)
         far = 1e3 * float(np.sqrt(change @ change / max(len(np.unique(equations.row[rows])), 1)))
         moved = f"the points are {three_digits(far)} mm off the fit to the others"
@@ -469,8 +469,8 @@ def _uneven_noise(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     """
     model = problem.linearize(x)
     columns = {tuple(block.measurement.components) for block in problem.data.blocks}
-    which = Equations.of(problem.data).component
-    if len(columns) > 1 or not which.any():
+    which = problem.equations.component
+    if len(columns) > 1 or not which.any() or problem.touches:  # touches have no columns
         return
     size = freedom = np.ones(which.max() + 1)
     for _ in range(MOST_ROUNDS):
@@ -489,31 +489,60 @@ def _uneven_noise(problem: CalibrationProblem, x: Array) -> Iterator[str]:
 
 
 def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Report rows that scatter far more than the others, if these agree with the stated noise without them.
+    """Report rows that scatter far more than the others, if these agree with the stated noise.
 
-    The rows of a fit of Huber's loss, then of those within `NOISY` times the stated noise, found in turn.
+    Two normal distributions, one of them the stated noise, must be far likelier than one of any width, with heavy tails
+    or without: the rows of the largest errors scatter more than the others in any sample. What parameters fit of them
+    is integrated out (Laplace).
     """
-    model, owners, N = problem.linearize(x), problem.owners, len(problem.data)
-    A, b, count = model.A, model.b, np.maximum(np.bincount(owners, minlength=N), 1)
-    weight, error = np.ones(N), np.ones(N)
-    for k in range(2 * MOST_ROUNDS):
-        w = weight[owners]
-        z = np.linalg.solve((A.T * w) @ A + np.eye(A.shape[1]), A.T @ (w * b))
-        error = np.sqrt(np.bincount(owners, (b - A @ z) ** 2, N) / count)
-        weight = 1 / np.maximum(error, 1) if k < MOST_ROUNDS else (error < NOISY).astype(float)
-    kept = weight > 0
-    spare = count[kept].sum() - _freedom(model)
-    if np.count_nonzero(~kept) < FEW or spare < _freedom(model):
+    if problem.touches:  # an equation is of several rows
         return
-    size = float(np.sqrt(np.sum(count[kept] * error[kept] ** 2) / spare))
-    times = rms(error[~kept]) / max(size, 1.0)
-    if size < NOTICED and times > SCATTERED:
-        rows = joined([problem.data.label[i] for i in np.flatnonzero(~kept)])  # all, as they are to be left out
-        yield (
-            f"residuals of rows {rows} are {three_digits(times)} times those of the others, which agree with the "
-            "stated noise: was the reflector loose in its nest, or the arm not at rest? Measure them again, or leave "
-            "them out ([exclude])."
-        )
+    model, owners, N = problem.linearize(x), problem.owners, len(problem.data)
+    A, b, count = model.A, model.b, np.maximum(np.bincount(owners, minlength=N), 1.0)
+
+    def fitted(spread: Callable[[Array], tuple[Array, Array]], w: Array) -> tuple[float, Array, Array]:
+        """Return the log marginal likelihood of all rows, their weights (N,) and squares (N,)."""
+        likelihood, squares = -np.inf, w
+        for _ in range(2 * MOST_ROUNDS):
+            H = (A.T * w[owners]) @ A + np.eye(A.shape[1])
+            z = np.linalg.solve(H, A.T @ (w[owners] * b))
+            squares = np.bincount(owners, (b - A @ z) ** 2, N).astype(float)
+            w, each = spread(squares)
+            likelihood = float(each.sum() - z @ z / 2 - np.linalg.slogdet(H)[1] / 2)
+        return likelihood, w, squares
+
+    def student(freedom: float, squares: Array) -> tuple[Array, Array]:
+        size, w = float(squares.sum() / count.sum()), count
+        for _ in range(MOST_ROUNDS):
+            size = max(size, 1.0)
+            w = (freedom + count) / (freedom + squares / size)
+            size = float(w @ squares / count.sum())
+        each = gammaln((freedom + count) / 2) - gammaln(freedom / 2) - count / 2 * np.log(freedom / 2 * size)
+        return w / size, each - (freedom + count) / 2 * np.log1p(squares / size / freedom)
+
+    def two(squares: Array) -> tuple[Array, Array]:
+        far, size, each = (squares > NOISY**2 * count).astype(float), 1.0, squares
+        for _ in range(MOST_ROUNDS):
+            size = max(float(far @ squares) / max(float(far @ count), TINY), SCATTERED**2)
+            part = np.clip(far.mean(), 1 / (2 * N), 1 - 1 / (2 * N))
+            wide = np.log(part) - squares / size / 2 - count / 2 * np.log(size)
+            each = np.logaddexp(np.log1p(-part) - squares / 2, wide)
+            far = np.exp(wide - each)
+        return 1 - far + far / size, each
+
+    normal, w, _ = fitted(partial(student, NORMAL), np.ones(N))
+    heavy, w, _ = fitted(partial(student, HEAVY), w)
+    likelihood, w, squares = fitted(two, w)
+    far = w < 0.5
+    if likelihood - max(normal, heavy) < LIKELIER or np.count_nonzero(far) < FEW:
+        return
+    times = float(np.sqrt(squares[far].sum() / count[far].sum()))
+    rows = joined([problem.data.label[i] for i in np.flatnonzero(far)])  # all, as they are to be left out
+    yield (
+        f"residuals of rows {rows} are {three_digits(times)} times those of the others, which agree with the "
+        "stated noise: was the reflector loose in its nest, or the arm not at rest? Measure them again, or leave "
+        "them out ([exclude])."
+    )
 
 
 def _said_of_kinds(problem: CalibrationProblem, rows: np.ndarray, left: float) -> str:
@@ -690,7 +719,8 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
             lengths[block.row] = np.column_stack([block.y, np.ones(len(block.y))])
     along = lengths[problem.owners]
     if lengths.any():  # in units of the equations
-        unit = np.linalg.norm(model.A, axis=1) / np.linalg.norm(problem.jacobian(x) * free.scale, axis=1)
+        slopes = problem.contrasts(problem.jacobian(x)) * free.scale
+        unit = np.linalg.norm(model.A, axis=1) / np.linalg.norm(slopes, axis=1)
         along *= unit[:, None]
     y = y[problem.owners]
     of_axis = model.A[:, base] / free.scale[base]
