@@ -135,14 +135,18 @@ def _contradicted(fit: Fit) -> Iterator[str]:
         if not beyond:
             return
         worst = max(beyond, key=lambda key: chi2[key] / len(groups[key]))
-        amounts = []
+        amounts, named = [], []
         for i, amount in zip(groups[worst], off[worst], strict=True):
-            factors = np.abs(known[i].rows[0])
-            unit, si = display(known[i].dimensions[int(factors.argmax())])
-            amounts.append(f"{amount / factors.max() / si:+.3g} {unit}")
-        named = joined([f"'{known[i].text}'" for i in groups[worst]])
+            factors, text = np.array(known[i].rows[0]), f"'{known[i].text}'"
+            largest = np.abs(factors).max()
+            unit, si = display(known[i].dimensions[int(np.abs(factors).argmax())])
+            amounts.append(f"{amount / largest / si:+.3g} {unit}")
+            if known[i].reference is None:  # a frame that is not stated has a nominal place that was found
+                nominal = factors @ p.nominal[[p.names.index(name) for name in known[i].names]]
+                text += f" (nominal: {nominal / largest / si:.5g} {unit})"
+            named.append(text)
         yield (
-            f"The data contradict prior {named}, by {joined(amounts)} (chi-squared {chi2[worst]:.0f}, "
+            f"The data contradict prior {joined(named)}, by {joined(amounts)} (chi-squared {chi2[worst]:.0f}, "
             f"degrees of freedom {len(amounts)}). Correct the known values, or take them out of the prior."
         )
         left = np.setdiff1d(np.arange(len(known)), groups[worst])

@@ -411,11 +411,11 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
         )
     kinds = {b.measurement.name: b.measurement for part in result.problem.rows() for b in part.data.blocks}
     if not any(kind.registers for kind in kinds.values()):
+        places = "first link, which places the base" + ", or three fixtures" * any(k.parameters for k in kinds.values())
         return (
             f"Missing: the base frame, which {joined(list(kinds))} readings do not determine: more of them hardly "
-            f"reduce U, at most {1e3 * bound:.3f} mm. State in [prior] what a survey or the data sheet says of the first "
-            'link, which places the base (known = ["theta1 = 0 +- 0.001 deg", ...] for its alpha, a, theta and d), or of '
-            "all anchors."
+            f"reduce U, at most {1e3 * bound:.3f} mm. State in [prior] what is known of the {places} "
+            '(known = ["theta1 = 0 +- 0.001 deg", ...] for its alpha, a, theta and d).'
         )
     measured = reached_positions(result, found.region, _measured(result), found.requirement.confidence)[1].max()
     apart = ""

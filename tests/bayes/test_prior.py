@@ -290,9 +290,12 @@ def test_priors_together_say_both_or_contradict() -> None:
 
 
 def test_a_known_value_that_the_data_contradict_is_named() -> None:
+    problem = ro.load("position").problem
+    nominal = 1e3 * problem.parameters.nominal[problem.parameters.names.index("tool_x")]
     for text, apart in (("tool_x = nominal + 8 +- 0.5 mm", True), ("tool_x = nominal - 1 +- 0.5 mm", False)):
-        causes = ro.calibrate(ro.load("position").problem, prior=Prior.known(text)).causes
-        assert (f"The data contradict prior '{text}', by " in "".join(causes)) == apart
+        causes = ro.calibrate(problem, prior=Prior.known(text)).causes
+        said = f"The data contradict prior '{text}' (nominal: {nominal:.5g} mm), by "
+        assert (said in "".join(causes)) == apart
 
 
 def test_a_known_value_counts_without_penalty_and_weight() -> None:

@@ -467,17 +467,33 @@ def test_exit_codes_say_the_verdict(monkeypatch, capsys, folder, tmp_path) -> No
     assert run(monkeypatch, "calibrate", "position", "--box", "0,800,-900,900,0,900") == 2
 
 
-def test_more_lengths_do_not_tell_where_the_base_stands() -> None:
-    """Nor do three anchors, which were asked for before; the first link does."""
-    instance = ro.load("cable")
-    result = instance.calibrate()
-    (reason,) = [
-        text for text in ro.calibration.accept(result, ro.data.Requirement(1e-4)).reasons if "U, at most" in text
-    ]
-    assert reason.startswith("Missing: the base frame, which cable readings do not determine")
-    assert "--augment" not in reason
-    said = str(ro.use.compensate(result, result.problem.data.blocks[0].q[:6, 0]))
-    assert "In 6 of 6 rows the expanded uncertainty (k = 2) is larger than the error that is corrected" in said
+@pytest.mark.parametrize(("name", "fixtures"), [("cable", True), ("distance", False)])
+def test_more_lengths_do_not_tell_where_the_base_stands(name: str, fixtures: bool) -> None:
+    """Nor do three anchors, which were asked for before, of distances as well; what is asked for now does."""
+    problem = ro.load(name).problem
+    nominal = dict(zip(problem.parameters.names, problem.parameters.nominal, strict=True))
+    prior = ro.bayes.Prior()
+    bounds = []
+    for stated in (
+        (),
+        ("alpha1 = {} +- 0.001 mrad", "a1 = {} +- 1 um", "theta1 = {} +- 0.001 mrad", "d1 = {} +- 1 um"),
+    ):
+        for text in stated:
+            value = (1e6 if "um" in text else 1e3) * nominal[text.split()[0]]
+            prior &= ro.bayes.Prior.known(text.format(value))
+        result = ro.calibrate(problem, prior=prior)
+        found = ro.calibration.accept(result, ro.data.Requirement(1e-4))
+        said = [text for text in found.reasons if "U, at most" in text]
+        if not stated:
+            (reason,) = said
+            assert reason.startswith(f"Missing: the base frame, which {name} readings do not determine")
+            assert ("fixtures" in reason) == fixtures
+            assert "--augment" not in reason
+        if fixtures and not stated:
+            said = str(ro.use.compensate(result, result.problem.data.blocks[0].q[:6, 0]))
+            assert "In 6 of 6 rows the expanded uncertainty (k = 2) is larger than the error that is corrected" in said
+        bounds.append(found.workspace.largest)
+    assert bounds[1] < bounds[0] / 10
 
 
 def test_joints_that_stood_are_named(tmp_path: Path) -> None:
