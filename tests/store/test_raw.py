@@ -545,6 +545,20 @@ def test_a_robot_that_moves_as_it_is_measured_is_named(monkeypatch, capsys, tmp_
     )
 
 
+def test_nothing_is_said_of_how_a_robot_moved_while_nothing_was_recorded(monkeypatch, capsys, tmp_path, arm) -> None:
+    """It was recorded at rest alone, and the last sample was measured 4 ms after its joint values."""
+    files = [tmp_path / "joints.csv", tmp_path / "points.csv"]
+    times = np.concatenate([5.0 * k + np.arange(10) / 20 for k in range(COUNT)])
+    log = [[f"{t:.3f}", f"{20 * (t // 5):.4f}", *["0"] * 5] for t in times]
+    files[0].write_text(text([["time [s]", *HEAD[1:7]]], log))
+    points = [[f"P{i}", f"{t + 0.004:.3f}", *POINTS[i // 10]] for i, t in enumerate(times)]
+    files[1].write_text(text([["Point", "time [s]", *HEAD[7:]]], points))
+    new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.01", "--dry-run")
+    said = capsys.readouterr().out
+    assert f"{10 * COUNT} rows match" in said
+    assert "the robot moved" not in said
+
+
 @pytest.mark.parametrize("late", [0.8, -0.3])
 def test_the_offset_of_a_clock_is_named_by_where_the_robot_stands_still(
     monkeypatch, capsys, tmp_path, arm, late

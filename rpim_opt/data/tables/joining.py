@@ -45,6 +45,7 @@ SIMULTANEOUS = 0.01
 """Times that differ by less than this part of the shortest time between rows are those of one row."""
 LOG, SMALL, MOVED = 2, 0.5, 0.01
 """Rows of joints a measured one, or median step [deg] of a joint, of a log, and the change [deg] that is named."""
+PAUSE = 10  # usual steps of a log from which on it was not recorded
 OFFSETS, STILL = np.linspace(-5, 5, 501), 0.02
 """Offsets of two clocks [s] that are tried, and how long the robot stands still before and after a measurement [s]."""
 RESTING, FEWEST = 0.95, 6  # part of the measured rows at rest with the offset of the clocks, and rows that tell it
@@ -343,7 +344,10 @@ def _by_time(joints: CanonicalTable, values: CanonicalTable, key: str, within: f
         f"joined by the nearest time: {len(right)} rows match, of {len(there)} with joints and {len(then)} measured; "
         f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
     ]
-    moved, ordered = _motion(joints, there, there[left], then[right]), np.sort(there)
+    moved, ordered = _motion(joints, there, there[left], then[right]), np.unique(there)
+    usual = np.median(np.diff(ordered, append=np.inf))
+    pause = np.diff(ordered, prepend=-np.inf, append=np.inf) > PAUSE * usual
+    moved[pause[np.searchsorted(ordered, then[right])]] = 0.0  # from one window to the next, of which nothing is known
     steps = _motion(joints, there, ordered[:-1], ordered[1:])
     if moved.max() > MOVED and (len(there) > LOG * len(right) or np.median(steps) < SMALL):
         count = np.count_nonzero(moved > MOVED)
