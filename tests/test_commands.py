@@ -243,10 +243,15 @@ def test_real_measurements(monkeypatch, tmp_path, name: str, robot: str, limit: 
 # --- new ---------------------------------------------------------------------------------------------------
 
 
-def test_held_out_rows_are_whole_configurations_drawn_by_the_seed(monkeypatch, cell, tmp_path) -> None:
+@pytest.mark.parametrize("visits", [False, True])
+def test_held_out_rows_are_whole_configurations_drawn_by_the_seed(monkeypatch, cell, tmp_path, visits: bool) -> None:
+    """Also where visits of one pose are configurations of their own: the others would validate nothing."""
     header, rows = table(cell / "measured.csv")
     twice = np.repeat(rows, 2, axis=0)
     twice[1::2, :3] += 1e-6
+    if visits:
+        header = ["label", *header, "configuration"]
+        twice = np.column_stack([np.arange(1, 81), twice, np.arange(80) // 2 + 100 * (np.arange(80) % 2)])
     write_csv(tmp_path / "twice.csv", header, twice)
     split = []
     for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):

@@ -159,9 +159,10 @@ def new_problem(
 
 
 def _held_out(rows: Dataset, fraction: float | None, seed: int) -> np.ndarray:
-    """Return which rows (N,) belong to configurations that are drawn at random."""
+    """Return which rows (N,) belong to configurations that are drawn at random, whole poses of equal joint values."""
     if fraction is None:
         return np.zeros(len(rows), dtype=bool)
+    rows = Dataset.together([rows], [""])
     known = len(np.unique(rows.configuration))
     if not 0 < fraction < 1 or known < 2:
         accepted = "a fraction between 0 and 1 of two or more configurations"
