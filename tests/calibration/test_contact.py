@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.causes.residuals import shown_by_residuals
+from rpim_opt.problem.causes.residuals import scattered_rows, shown_by_residuals
 from rpim_opt.problem.registration.frames import ridge_deviations
 from rpim_opt.report import write_report
 from rpim_opt.store.instances import UNSTATED
@@ -157,3 +157,20 @@ def test_touches_of_which_too_little_noise_is_stated_show_no_mistake(name: str) 
     every = problem.on(replace(data, blocks=tuple(finer)))
     for some in (every, every.without(set(np.concatenate(known)))):
         assert list(shown_by_residuals(some, ridge_deviations(some))) == []
+
+
+def test_touches_at_which_the_tip_was_loose_are_named_row_by_row() -> None:
+    """What is left of a point's touches without it is of all of them: rows were named of which none was loose."""
+    problem = ro.load("contact").problem
+    rng = np.random.default_rng(0)
+    blocks, loose = [], set()
+    for block in problem.data.blocks:
+        some = block.measurement.touching & (rng.random(len(block.q)) < 0.3)
+        loose |= set(np.array(problem.data.label)[block.row[some]])
+        moved = some[:, None, None] * rng.normal(0, 5e-4, block.q.shape)
+        blocks.append(replace(block, q=block.q + moved))
+    wrong = problem.on(replace(problem.data, blocks=tuple(blocks)))
+    (said,) = scattered_rows(wrong, ridge_deviations(wrong))
+    named = set(re.split(", | and ", said.split("rows ")[1].split(" are ")[0]))
+    assert named <= loose
+    assert len(named) > 0.7 * len(loose)

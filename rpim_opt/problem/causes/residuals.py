@@ -31,6 +31,7 @@ from rpim_opt.problem.causes.rows import (
     stretched_length,
 )
 from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import SHIFTED, CalibrationProblem
 from rpim_opt.problem.registration.frames import ridge_deviations
 from rpim_opt.problem.registration.points import fit_points, points_of
@@ -51,6 +52,7 @@ LOADS, SINGULAR = 0.6, 1e-9
 TWO_KINDS, STARTS = 0.4, 30
 """Rows are of two kinds if two calibrations leave less than this part of the residuals of one; starts of the search."""
 SCATTERED = 5.0  # residuals of rows over those of the others from which on they are of another kind
+FREE = 1.0  # [m, rad] standard deviation of where touched points and planes are
 NORMAL, HEAVY, LIKELIER = 1e3, 3.0, 7.0
 """Degrees of freedom of Student's distributions of all rows; log odds at which some are of another kind (1,000:1)."""
 JUMPING = 0.5  # mean square step of every joint over that of rows in random order, above which rows have no order
@@ -495,10 +497,8 @@ def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     or without: the rows of the largest errors scatter more than the others in any sample. What parameters fit of them
     is integrated out (Laplace).
     """
-    if problem.touches:  # an equation is of several rows
-        return
-    model, owners, N = problem.linearize(x), problem.owners, len(problem.data)
-    A, b, count = model.A, model.b, np.maximum(np.bincount(owners, minlength=N), 1.0)
+    (A, b, owners), N = _row_by_row(problem, x), len(problem.data)
+    count = np.bincount(owners, minlength=N).astype(float)
 
     def fitted(spread: Callable[[Array], tuple[Array, Array]], w: Array) -> tuple[float, Array, Array]:
         """Return the log marginal likelihood of all rows, their weights (N,) and squares (N,)."""
@@ -533,7 +533,7 @@ def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     normal, w, _ = fitted(partial(student, NORMAL), np.ones(N))
     heavy, w, _ = fitted(partial(student, HEAVY), w)
     likelihood, w, squares = fitted(two, w)
-    far = w < 0.5
+    far = (w < 0.5) & (count > 0)
     if likelihood - max(normal, heavy) < LIKELIER or np.count_nonzero(far) < FEW:
         return
     times = float(np.sqrt(squares[far].sum() / count[far].sum()))
@@ -543,6 +543,27 @@ def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         "stated noise: was the reflector loose in its nest, or the arm not at rest? Measure them again, or leave "
         "them out ([exclude])."
     )
+
+
+def _row_by_row(problem: CalibrationProblem, x: Array) -> tuple[Array, Array, np.ndarray]:
+    """Return whitened equations A z ~ b, (m, n + c) and (m,), each of one row, and these rows (m,).
+
+    Those of touches have c places of the touched points and planes, as good as free, beside the parameters.
+    """
+    touches = problem.touches
+    if touches is None:
+        model = problem.linearize(x)
+        return model.A, model.b, problem.owners
+    equations = Equations.of(problem.data)
+    residual, jacobian = problem.slopes(x)
+    own, places = [], []
+    for thing, index in zip(touches.where, touches.rows, strict=True):
+        own.append(index[:, : len(thing.shown)].ravel())
+        places.append(FREE * np.kron(thing.places, np.eye(len(thing.shown))))
+    some = np.concatenate(own)
+    sigma = np.sqrt(equations.covariance[some, equations.component[some]])
+    A = np.hstack([jacobian[some] * problem.parameters.free.scale, scipy.linalg.block_diag(*places)])
+    return A / sigma[:, None], (residual + jacobian @ x)[some] / sigma, equations.row[some]
 
 
 def _said_of_kinds(problem: CalibrationProblem, rows: np.ndarray, left: float) -> str:
