@@ -41,7 +41,7 @@ from rpim_opt.problem.causes.residuals import (
     NOTICED,
     SLIGHT,
     another_robot,
-    geared_otherwise,
+    wrong_gear_ratio,
     shown_by_residuals,
 )
 from rpim_opt.problem.causes.rows import (
@@ -862,7 +862,7 @@ def _in_place_of_extensions(result: Outcome, alone: CalibrationProblem) -> Itera
     plain = min((trial.value for trial in learned.trials if not trial.extensions), default=np.inf)
     most = np.exp((min(trial.value for trial in learned.trials) - plain) / result.program.model.equations)
     x, most = ridge_deviations(bare), min(MOVED, float(most))
-    yield from first(shown_by_residuals(bare, x, most=most), geared_otherwise(bare, x, most))
+    yield from first(shown_by_residuals(bare, x, most=most), wrong_gear_ratio(bare, x, most))
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:

@@ -256,10 +256,10 @@ def update(
     elsewhere = ""
     base = tuple(name for name in free.names if name.startswith(registration(free, data)))
     wide = np.array(free.names)[prior_widths(result, problem) >= PLACE].tolist()
-    anew = tuple(name for name in wide if of_session(name) and name not in result.problem.parameters.free.names)
-    if not released and not anew:
+    unplaced = tuple(name for name in wide if of_session(name) and name not in result.problem.parameters.free.names)
+    if not released and not unplaced:
         elsewhere, released = _base_elsewhere(result, problem, base, prior_inflation)
-    released += tuple(name for name in anew if name not in released)
+    released += tuple(name for name in unplaced if name not in released)
     # a base that was reset may be anywhere: then it is registered again
     start = None if base and {*base} <= {*released} else previous_deviations(result, problem)
     changes: list[Cause] = []
@@ -294,9 +294,9 @@ def update(
     last = Earlier(
         result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],
         len(result.problem.labels), {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
-        prior_inflation, tuple(name for name in released if name not in anew), left_out,
+        prior_inflation, tuple(name for name in released if name not in unplaced), left_out,
     )  # fmt: skip
-    held_out = None if {*released} - {*anew} else result.record.validation  # which was measured before a change
+    held_out = None if {*released} - {*unplaced} else result.record.validation  # which was measured before a change
     figures, said = _errors(result, updated, held_out)
     elsewhere = " ".join(filter(None, [elsewhere, said]))
     updated = replace(updated, record=_carried_on(result.record, last, source))

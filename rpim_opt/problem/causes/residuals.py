@@ -61,7 +61,7 @@ COURSES = 6  # half waves that a slow motion has over all rows at most
 PLACES, PRECISE, SPANS = 40, 120, 12
 """Rows and joint values from which on something may have moved, and those between which it did and moved back."""
 MOST_EQUATIONS = 3000  # equations up to which a change is looked for
-TURNED = 0.02  # movement of a joint [rad, m] from which on its slope says too little
+BEYOND_SLOPES = 0.02  # movement of a joint [rad, m] from which on its slope says too little
 OUTLYING_ROUNDS = 3  # in which outliers of the one calibration are found
 
 
@@ -75,7 +75,7 @@ class Addition(NamedTuple):
     columns: Array
     said: Callable[[Array], tuple[str, str]] | None  # None where it is no mistake
     most: float = np.inf  # coefficient from which on a slope says nothing
-    geared: Callable[[Array], Array] | None = None  # the robot's joint map with it, of gears
+    joint_map: Callable[[Array], Array] | None = None  # the robot's joint map with it, of gears
 
 
 def _explained(
@@ -194,18 +194,18 @@ def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[st
         yield f"{what} (the residual RMS falls to {100 * best[0]:.0f} %): {remedy}."
 
 
-def geared_otherwise(problem: CalibrationProblem, x: Array, most: float) -> Iterator[str]:
+def wrong_gear_ratio(problem: CalibrationProblem, x: Array, most: float) -> Iterator[str]:
     """Say which gear ratio or coupling leaves at most a part of the squares at x (n,) where its slope says too little.
 
     All is fitted anew with it: of a ratio 3 % off a joint is 50 mrad off at its ends.
     """
     model = problem.linearize(x)
     best = _explained(model, x, problem.equations.angle, _gears(problem, model))
-    if best is None or (geared := best[1].geared) is None:
+    if best is None or (joint_map := best[1].joint_map) is None:
         return
 
     def changed(factor: float) -> CalibrationProblem:
-        return replace(problem, robots=replace(problem.robot, joint_map=geared(np.array([factor]))))
+        return replace(problem, robots=replace(problem.robot, joint_map=joint_map(np.array([factor]))))
 
     def error(factor: float) -> float:
         return rms(changed(factor).errors(ridge_deviations(changed(factor))))
@@ -214,7 +214,7 @@ def geared_otherwise(problem: CalibrationProblem, x: Array, most: float) -> Iter
     found = scipy.optimize.minimize_scalar(error, bounds=ends, method="bounded", options={"xatol": 1e-3 * ends.std()})
     left = found.fun / max(rms(problem.errors(x)), TINY)
     turned = np.abs(changed(found.x).joint_values - problem.joint_values).max()
-    if left**2 <= most and turned > TURNED:
+    if left**2 <= most and turned > BEYOND_SLOPES:
         yield from _said_of_addition((left, best[1], np.array([found.x])))
 
 
@@ -694,7 +694,7 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
     q = problem.joint_values
     of_zero = {i: slopes[:, free.names.index(name)] for i, name in enumerate(_zeros(robot)) if name in free.names}
 
-    def geared(i: int, j: int, coefficients: Array) -> Array:
+    def joint_map(i: int, j: int, coefficients: Array) -> Array:
         to_model = robot.joint_map.copy()
         to_model[i] += coefficients[0] * robot.joint_map[j]
         return to_model
@@ -709,12 +709,12 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
             what = f"joint {one} is coupled to joint {other} (q{i + 1} {part:+.4f} q{j + 1})"
             if abs(part) < COUPLED:
                 return what, "no gears have so small a ratio: have bearings, hoses and mounting of both joints checked"
-        return what, coupling(geared(i, j, coefficients))
+        return what, coupling(joint_map(i, j, coefficients))
 
     for i, j in product(of_zero, range(q.shape[1])):
         if q[:, j].any():
             column = of_zero[i] * q[problem.owners, j]
-            yield Addition(column[:, None], partial(gear, i, j), geared=partial(geared, i, j))
+            yield Addition(column[:, None], partial(gear, i, j), joint_map=partial(joint_map, i, j))
     if len(of_zero) == len(robot.mdh):
         way = np.diff(q, axis=0, prepend=q[:1])[problem.owners]
         lag = np.sum([zero * way[:, i] for i, zero in of_zero.items()], axis=0)
