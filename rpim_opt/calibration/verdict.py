@@ -41,8 +41,8 @@ from rpim_opt.problem.causes.residuals import (
     NOTICED,
     SLIGHT,
     another_robot,
-    wrong_gear_ratio,
     shown_by_residuals,
+    wrong_gear_ratio,
 )
 from rpim_opt.problem.causes.rows import (
     ANGULAR,
