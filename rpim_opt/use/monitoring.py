@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -317,6 +317,91 @@ def cusum_limit(count: int, level: float) -> float:
     return float(scipy.optimize.bisect(alarms, 1e-3, HIGHEST_LIMIT, xtol=1e-4))
 
 
+Explained = tuple[float, Drift]
+"""An explanation of checks, after the logarithm of its probability."""
+
+
+class _Explanations:
+    """Changes before a check or steadily from the first to the last, and single readings that are wrong.
+
+    Set-ups of which ``own`` (s, N) has the rows may have moved beside. A frame may have moved whether it was identified
+    or not: else the robot's parameters are blamed for it. Rows of one configuration were read together, at the time of
+    the first of them.
+    """
+
+    def __init__(self, result: Calibration, problem: CalibrationProblem, own: Array) -> None:
+        framed, base, mine = _framed(problem)
+        self.result, self.free, self.count = result, framed.parameters.free, len(problem.data)
+        self.form = recalibration.penalty_of(recalibration.posterior_as_prior(result, problem), len(mine))
+        model = framed.linearize(recalibration.previous_deviations(result, framed))
+        self.A = model.A / np.sqrt(result.variance_factor)
+        moves = [model.A[:, base] * rows[problem.owners, None] for rows in own]
+        self.model = replace(model, A=np.hstack([model.A[:, mine], *moves]))
+        self.width = recalibration.prior_widths(result, framed) / self.free.scale
+        numbers, first = np.unique(problem.data.configuration, return_index=True)
+        self.when, self.starts = first[np.searchsorted(numbers, model.group)], np.sort(first).tolist()
+        moments = np.linspace(0, len(self.starts) - 1, min(len(self.starts), MOMENTS))
+        self.moments = np.unique(moments.round().astype(int)).tolist()
+        readings = list(recalibration.readings(problem, self.model))
+        self.equations = {cause.members: rows for cause, rows in readings}
+        causes = [*recalibration.candidates(framed), *(cause for cause, _ in readings)]
+        self.priors = dict(zip(causes, recalibration.log_priors(causes).tolist(), strict=True))
+
+    def columns(self, drift: Drift) -> Array:
+        """Return the effect (m, c) of a change: of one that is steady, a part of the whole on every reading."""
+        course = self.when / (self.count - 1) if drift.steady else self.when >= drift.first
+        return self.A[:, self._places(drift.cause)] * course[:, None]
+
+    def found(self, kept: Array, beside: Array | None = None) -> list[Explained]:
+        """Return explanations of the equations that are kept (m, 1); with columns ``beside`` (m, c), readings alone."""
+        also = np.zeros((len(kept), 0)) if beside is None else beside * np.sqrt(self.result.variance_factor)
+        model = replace(self.model, A=np.hstack([self.model.A, also]) * kept, b=self.model.b * kept[:, 0])
+        wide = np.pad(self.form.matrix, ((0, 0), (0, model.A.shape[1] - self.form.matrix.shape[1])))
+        misfit = recalibration.Misfit(self.result, model, replace(self.form, L=wide))
+        found: list[Explained] = []
+        for cause in self.priors:
+            if cause.kind == "reading":
+                found.append(self._wrong(misfit, kept, cause))
+            elif beside is None:
+                found += self._changes(misfit, kept, cause)
+        return found
+
+    def _places(self, cause: recalibration.Cause) -> list[int]:
+        return [self.free.names.index(name) for name in cause.members]
+
+    def _changes(self, misfit: recalibration.Misfit, kept: Array, cause: recalibration.Cause) -> list[Explained]:
+        """Return a change before some checks, all around the best of these, and steadily."""
+
+        def before(i: int) -> Explained:
+            return self._changed(misfit, kept, Drift(cause, self.starts[i], False, None))
+
+        steps = list(map(before, self.moments))
+        k = max(range(len(steps)), key=lambda k: steps[k][0])
+        around = range(self.moments[max(k - 1, 0)] + 1, self.moments[min(k + 1, len(steps) - 1)])
+        steps += [before(i) for i in around if i not in self.moments]
+        return steps + [self._changed(misfit, kept, Drift(cause, 0, True, None))] * (self.count > 2)
+
+    def _changed(self, misfit: recalibration.Misfit, kept: Array, drift: Drift) -> Explained:
+        index = self._places(drift.cause)
+        g, G = misfit.projected(slice(misfit.m), kept * self.columns(drift))
+        moved, scale = None, float(self.free.scale[index[0]])
+        if len(g) == 1 and G[0, 0] > 0:
+            change, std = float(scale * g[0] / G[0, 0]), float(scale / np.sqrt(G[0, 0]))
+            moved = recalibration.Moved(drift.cause.name, self.free.dimensions[index[0]], change, std)
+        log = self.priors[drift.cause] + recalibration.log_bayes_factor(g, G, self.width[index])
+        return log, drift._replace(cause=misfit.evidence(drift.cause, g, G), moved=moved)
+
+    def _wrong(self, misfit: recalibration.Misfit, kept: Array, cause: recalibration.Cause) -> Explained:
+        rows = self.equations[cause.members]
+        g, G = misfit.projected(rows, kept[rows] * np.eye(len(rows)))
+        bayes = recalibration.log_bayes_factor(g, G, np.full(len(rows), recalibration.OUTLIER_WIDTH))
+        return self.priors[cause] + bayes, Drift(misfit.evidence(cause, g, G), int(self.when[rows[0]]), False, None)
+
+
+def _likeliest(found: Iterable[Explained]) -> Drift:
+    return max(found, key=lambda each: each[0])[1]  # as `update` has it: p-values favour few parameters
+
+
 def _drift(
     result: Calibration, problem: CalibrationProblem, own: Array, level: float
 ) -> tuple[Drift | None, tuple[recalibration.Cause, ...]]:
@@ -324,88 +409,25 @@ def _drift(
 
     None, or none, where chance explains them, over all that were tried.
     """
-    # a frame may have moved whether it was identified or not: else the robot's parameters are blamed for it
-    framed, base, mine = _framed(problem)
-    free = framed.parameters.free
-    form = recalibration.penalty_of(recalibration.posterior_as_prior(result, problem), len(mine))
-    model = framed.linearize(recalibration.previous_deviations(result, framed))
-    A = model.A / np.sqrt(result.variance_factor)
-    moves = [model.A[:, base] * rows[problem.owners, None] for rows in own]
-    model = replace(model, A=np.hstack([model.A[:, mine], *moves]))
-    form = replace(form, L=np.pad(form.matrix, ((0, 0), (0, len(own) * len(base)))))
-    # rows of one configuration were read together: the first of them has the time
-    numbers, first = np.unique(problem.data.configuration, return_index=True)
-    when = first[np.searchsorted(numbers, model.group)]
-    count, starts = len(problem.data), np.sort(first).tolist()
-    moments = np.unique(np.linspace(0, len(starts) - 1, min(len(starts), MOMENTS)).round().astype(int)).tolist()
-    width = recalibration.prior_widths(result, framed) / free.scale
-    readings = list(recalibration.readings(problem, model))
-    equations = {cause.members: rows for cause, rows in readings}
-    causes = [*recalibration.candidates(framed), *(cause for cause, _ in readings)]
-    priors = recalibration.log_priors(causes)
-
-    def columns(cause: recalibration.Cause, start: int, steady: bool) -> Array:
-        """Return the effect (m, c) of a change before a check, or steadily: of readings a part of the whole."""
-        course = when / (count - 1) if steady else when >= start
-        return A[:, [free.names.index(name) for name in cause.members]] * course[:, None]
-
-    def tried(kept: Array, beside: Array) -> Iterator[tuple[float, Drift]]:
-        """Yield explanations of the equations that are kept (m, 1), with logarithms of their probabilities.
-
-        Of single readings alone where another change has its columns (m, c) ``beside``.
-        """
-        whole = np.hstack([model.A, beside * np.sqrt(result.variance_factor)]) * kept
-        prior_form = replace(form, L=np.pad(form.matrix, ((0, 0), (0, beside.shape[1]))))
-        misfit = recalibration.Misfit(result, replace(model, A=whole, b=model.b * kept[:, 0]), prior_form)
-
-        def moved(cause: recalibration.Cause, prior: float, start: int, steady: bool = False) -> tuple[float, Drift]:
-            index = [free.names.index(name) for name in cause.members]
-            scale = float(free.scale[index[0]])
-            g, G = misfit.projected(slice(misfit.m), kept * columns(cause, start, steady))
-            amount = None
-            if len(g) == 1 and G[0, 0] > 0:
-                change, std = scale * g[0] / G[0, 0], scale / np.sqrt(G[0, 0])
-                amount = recalibration.Moved(cause.name, free.dimensions[index[0]], float(change), float(std))
-            drift = Drift(misfit.evidence(cause, g, G), start, steady, amount)
-            return prior + recalibration.log_bayes_factor(g, G, width[index]), drift
-
-        for cause, prior in zip(causes, priors.tolist(), strict=True):
-            if cause.kind == "reading":
-                rows = equations[cause.members]
-                change = misfit.projected(rows, kept[rows] * np.eye(len(rows)))
-                bayes = recalibration.log_bayes_factor(*change, np.full(len(rows), recalibration.OUTLIER_WIDTH))
-                yield prior + bayes, Drift(misfit.evidence(cause, *change), int(when[rows[0]]), False, None)
-            elif not beside.size:
-                steps = [moved(cause, prior, starts[i]) for i in moments]
-                yield from steps
-                k = max(range(len(steps)), key=lambda k: steps[k][0])
-                around = range(moments[max(k - 1, 0)] + 1, moments[min(k + 1, len(moments) - 1)])
-                yield from (moved(cause, prior, starts[i]) for i in around if i not in moments)
-                if count > 2:
-                    yield moved(cause, prior, 0, True)
-
-    def likeliest(found: Iterable[tuple[float, Drift]]) -> Drift:
-        return max(found, key=lambda each: each[0])[1]  # as `update` has it: p-values favour few parameters
-
-    kept, nothing = np.ones((len(A), 1)), np.zeros((len(A), 0))
+    explanations = _Explanations(result, problem, own)
+    kept = np.ones((len(explanations.A), 1))
     wrong: list[recalibration.Cause] = []
-    whole = list(tried(kept, nothing))
-    found = whole
+    whole = found = explanations.found(kept)
     while True:
-        best = out = likeliest(found)
+        best = out = _likeliest(found)
         if best.cause.p_value * len(found) >= level:
             return None, tuple(wrong)
         if best.cause.kind != "reading":  # beside which readings may be wrong, too
-            out = likeliest(tried(kept, columns(best.cause, best.first, best.steady)))
+            out = _likeliest(explanations.found(kept, explanations.columns(best)))
         if out.cause.p_value * len(found) >= level:
             break
-        if len(wrong) >= recalibration.SPARED * count:  # of so many none is wrong by itself
+        if len(wrong) >= recalibration.SPARED * explanations.count:  # of so many none is wrong by itself
             wrong, found = [], [each for each in whole if each[1].cause.kind != "reading"]
-            best = likeliest(found)
+            best = _likeliest(found)
             break
         wrong.append(out.cause)
-        kept[equations[out.cause.members]] = 0.0
-        found = list(tried(kept, nothing))
+        kept[explanations.equations[out.cause.members]] = 0.0
+        found = explanations.found(kept)
     least = best.cause.gain - recalibration.AS_GOOD
     others = [drift.cause for _, drift in found if drift.cause.gain > least]  # but those that contain it
     apart = dict.fromkeys(cause.name for cause in others if not {*cause.members} >= {*best.cause.members})
