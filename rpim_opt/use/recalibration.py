@@ -255,8 +255,7 @@ def update(
     say("comparing with the previous calibration")
     elsewhere = ""
     base = tuple(name for name in free.names if name.startswith(registration(free, data)))
-    wide = np.array(free.names)[prior_widths(result, problem) >= PLACE].tolist()
-    unplaced = tuple(name for name in wide if of_session(name) and name not in result.problem.parameters.free.names)
+    unplaced = _unplaced(result, problem)
     if not released and not unplaced:
         elsewhere, released = _base_elsewhere(result, problem, base, prior_inflation)
     released += tuple(name for name in unplaced if name not in released)
@@ -374,6 +373,13 @@ def _undetermined(updated: Calibration, known: Collection[str]) -> tuple[str, ..
 
 def _robots(result: Calibration) -> str:
     return " and ".join(robot.name for robot in result.problem.arms.values())
+
+
+def _unplaced(result: Calibration, problem: CalibrationProblem) -> tuple[str, ...]:
+    """Return the parameters of a new session whose scales say nothing of where it is."""
+    free = problem.parameters.free
+    wide = np.array(free.names)[prior_widths(result, problem) >= PLACE].tolist()
+    return tuple(name for name in wide if of_session(name) and name not in result.problem.parameters.free.names)
 
 
 def _base_elsewhere(
