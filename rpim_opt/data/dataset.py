@@ -19,7 +19,7 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import from_matrices, pose, position
 from rpim_opt.robot.parameters import session_prefix
 
-STILL = 1e-4  # [rad, m] by which joint values of an arm at rest scatter at most; no two poses are so near on purpose
+AT_REST = 1e-4  # [rad, m] by which joint values of an arm at rest scatter at most; no two poses are so near on purpose
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -333,9 +333,9 @@ def stops(q: Array) -> np.ndarray:
     """
     q = q.reshape(len(q), -1)
     first, moved = 0, np.ones(len(q), dtype=bool)
-    for i in np.flatnonzero((np.abs(np.diff(q, axis=0)) <= 2 * STILL).all(axis=1)) + 1:
+    for i in np.flatnonzero((np.abs(np.diff(q, axis=0)) <= 2 * AT_REST).all(axis=1)) + 1:
         first = i - 1 if moved[i - 1] else first
-        moved[i] = (np.abs(q[i] - q[first]) > STILL).any()
+        moved[i] = (np.abs(q[i] - q[first]) > AT_REST).any()
     equal = np.unique(q, axis=0, return_inverse=True)[1]
     return _united(np.asarray(equal).reshape(-1), np.arange(len(q)), np.cumsum(moved))
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from scipy.special import logsumexp
@@ -69,6 +69,10 @@ class Cause(NamedTuple):
     gain: float = 0.0  # by which chi-squared falls
     p_value: float = 1.0  # of that where nothing changed
     probability: float = 0.0  # posterior
+
+
+Weighed = tuple[tuple[Cause, ...], Fit]
+"""All causes with their evidence, the most probable first, and how well all fits."""
 
 
 class Moved(NamedTuple):
@@ -261,34 +265,11 @@ def update(
     released += tuple(name for name in unplaced if name not in released)
     # a base that was reset may be anywhere: then it is registered again
     start = None if base and {*base} <= {*released} else previous_deviations(result, problem)
-    changes: list[Cause] = []
-    most = {"reading": max(SPARED * len(data), 1)}
-    first: tuple[tuple[Cause, ...], Fit] | None = None  # before anything is released
-    while True:
-        updated = _recalibrated(result, problem, released, prior_inflation, start)
-        # a fit without a change spreads it over what is hardly known, and leaves the range of its slopes
-        at = updated.x if released or changes else previous_deviations(result, updated.problem)
-        causes, after = _weighed(result, updated.problem, at, updated.formulation, released)
-        first = first or (causes, after)
-        # the most probable of the causes that chance does not explain
-        cause = next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)
-        if cause is None:
-            break
-        alike = [each for each in changes if (each.kind == "reading") == (cause.kind == "reading")]
-        if len(alike) >= most.get(cause.kind, MOST):
-            break
-        say(f"releasing {cause.name}")
-        changes.append(cause)
-        problem = problem.with_parameters(updated.problem.parameters)  # of a base where it was registered
-        if cause.kind == "reading":
-            problem = problem.without(set(cause.members))
-        else:
-            released += cause.members
-        start = updated.x
+    first, updated, released, changes, after = _in_turn(result, problem, released, prior_inflation, start, say)
     if not after.likely:
         _refuse_another_robot(result, updated, data, bool({*base} & {*released}))
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
-    updated = _with_scales_of_motion(result, updated, problem, released, prior_inflation)
+    updated = _with_scales_of_motion(result, updated, released, prior_inflation)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     last = Earlier(
         result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],
@@ -302,7 +283,44 @@ def update(
     moved = _moved(result, updated, released, changes)
     unclear = {each.name for each in moved if abs(each.change) < 2 * each.std}
     vague += tuple(cause.name for cause in changes if unclear.issuperset(cause.members))
-    return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
+    return Update(updated, first[1], after, changes, first[0], moved, len(data), figures, elsewhere, vague)
+
+
+def _in_turn(
+    result: Calibration,
+    problem: CalibrationProblem,
+    released: tuple[str, ...],
+    inflation: float,
+    start: Array | None,
+    say: Callable[[str], None],
+) -> tuple[Weighed, Calibration, tuple[str, ...], tuple[Cause, ...], Fit]:
+    """Release the most probable change, one after the other, until chance explains the rest.
+
+    Return all causes and the fit before anything is released, the last calibration, what is released there, the changes
+    in the order of their discovery, and the fit after them.
+    """
+    changes: list[Cause] = []
+    most = {"reading": max(SPARED * len(problem.data), 1)}
+    first: Weighed | None = None
+    while True:
+        updated = _recalibrated(result, problem, released, inflation, start)
+        # a fit without a change spreads it over what is hardly known, and leaves the range of its slopes
+        at = updated.x if released or changes else previous_deviations(result, updated.problem)
+        causes, after = _weighed(result, updated.problem, at, updated.formulation, released)
+        first = first or (causes, after)
+        # the most probable of the causes that chance does not explain
+        cause = next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)
+        alike = [each for each in changes if cause and (each.kind == "reading") == (cause.kind == "reading")]
+        if cause is None or len(alike) >= most.get(cause.kind, MOST):
+            return first, updated, released, tuple(changes), after
+        say(f"releasing {cause.name}")
+        changes.append(cause)
+        problem = problem.with_parameters(updated.problem.parameters)  # of a base where it was registered
+        if cause.kind == "reading":
+            problem = problem.without(set(cause.members))
+        else:
+            released += cause.members
+        start = updated.x
 
 
 def _reset(result: Calibration, data: Dataset, free: Parameters, reset: Sequence[str]) -> tuple[str, ...]:
@@ -406,7 +424,7 @@ def _base_elsewhere(
 
 
 def _with_scales_of_motion(
-    result: Calibration, updated: Calibration, problem: CalibrationProblem, released: tuple[str, ...], inflation: float
+    result: Calibration, updated: Calibration, released: tuple[str, ...], inflation: float
 ) -> Calibration:
     """Return the update with frames that were released as far from nominal as their scales say, or nearer.
 
@@ -418,6 +436,7 @@ def _with_scales_of_motion(
     farther = np.isin(p.names, released) & p.of_frames & (distance > p.scale)
     if not farther.any():
         return updated
+    problem = cast(CalibrationProblem, updated.problem)
     problem = problem.with_parameters(replace(p, scale=np.where(farther, distance, p.scale)))
     return _recalibrated(result, problem, released, inflation, updated.x)
 
@@ -469,7 +488,7 @@ def _between_rows(result: Calibration, data: Dataset) -> str:
     return f"Likely: {said[0]}" if said else ""
 
 
-def _changes(result: Calibration, data: Dataset) -> tuple[tuple[Cause, ...], Fit]:
+def _changes(result: Calibration, data: Dataset) -> Weighed:
     """Return all that may have changed before new measurements, as of `_weighed`, at the previous deviations."""
     problem = with_data(result, data)
     return _weighed(result, problem, previous_deviations(result, problem), posterior_as_prior(result, problem), ())
@@ -682,9 +701,7 @@ def readings(problem: Source, model: LinearModel) -> Iterator[tuple[Cause, np.nd
         yield Cause(labels[0], "reading", tuple(labels)), np.flatnonzero(model.group == number)
 
 
-def _weighed(
-    result: Calibration, problem: Source, x: Array, prior: Formulation, released: Sequence[str]
-) -> tuple[tuple[Cause, ...], Fit]:
+def _weighed(result: Calibration, problem: Source, x: Array, prior: Formulation, released: Sequence[str]) -> Weighed:
     """Return all causes with their evidence at x (n,) [SI], the most probable first, and how well all fits."""
     free = problem.parameters.free
     model = problem.linearize(x)

@@ -77,6 +77,15 @@ def test_an_instrument_better_than_the_robot_repeats_is_no_formulation_that_limi
     assert found.delivered, str(found)
 
 
+def test_the_zero_of_joint_1_is_named_before_the_base() -> None:
+    """Both turn the arm alike; a fit without a change spread it over them, and left the range of its slopes."""
+    robot = happened(4, theta1=0.02)
+    found = ro.use.update(ro.calibrate(robot.problem.on(robot.before)), robot.after)
+    assert found.changes[0].members == ("theta1",)
+    assert found.causes[0].gain > 0.99 * found.before.squares
+    assert "do not distinguish this from a change of base" in str(found)
+
+
 def test_a_motor_that_moves_two_joints_shifts_both_zeros() -> None:
     """As of a parallelogram: a length was blamed, and good readings were left out."""
     robot = happened(6, theta2=3e-3, theta3=-3e-3)

@@ -208,7 +208,8 @@ def wrong_gear_ratio(problem: CalibrationProblem, x: Array, most: float) -> Iter
         return replace(problem, robots=replace(problem.robot, joint_map=joint_map(np.array([factor]))))
 
     def error(factor: float) -> float:
-        return rms(changed(factor).errors(ridge_deviations(changed(factor))))
+        other = changed(factor)
+        return rms(other.errors(ridge_deviations(other)))
 
     ends = np.sort(best[2] * [0.8, 1.2])
     found = scipy.optimize.minimize_scalar(error, bounds=ends, method="bounded", options={"xatol": 1e-3 * ends.std()})

@@ -127,8 +127,8 @@ def read_staubli(text: str) -> Rows:
             i += 1
     rows = _rows(targets)
     parts = [row["label"].rstrip("]").partition("[") for row in rows]
-    sizes = Counter(array for array, _, _ in parts)
-    names = [key if len(sizes) == 1 else array if sizes[array] == 1 else f"{array}[{key}]" for array, _, key in parts]
+    counts = Counter(array for array, _, _ in parts)
+    names = [key if len(counts) == 1 else array if counts[array] == 1 else f"{array}[{key}]" for array, _, key in parts]
     return [{**row, "label": name} for row, name in zip(rows, names, strict=True)]
 
 
