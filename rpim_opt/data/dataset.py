@@ -327,17 +327,19 @@ def _numbered(keys: Iterable[Any]) -> np.ndarray:
 
 
 def stops(q: Array) -> np.ndarray:
-    """Return numbers (N,) of joint values (N, ...) [rad or m], one for all rows of equal ones.
+    """Return numbers (N,) of joint values (N, ...) [rad or m]: those that differ by no more than `AT_REST` are one.
 
-    Consecutive rows that differ from the first of them by no more than encoders scatter are of one stop as well.
+    In lexicographic order, each that belongs to no earlier one takes all within that distance.
     """
-    q = q.reshape(len(q), -1)
-    first, moved = 0, np.ones(len(q), dtype=bool)
-    for i in np.flatnonzero((np.abs(np.diff(q, axis=0)) <= 2 * AT_REST).all(axis=1)) + 1:
-        first = i - 1 if moved[i - 1] else first
-        moved[i] = (np.abs(q[i] - q[first]) > AT_REST).any()
-    equal = np.unique(q, axis=0, return_inverse=True)[1]
-    return _united(np.asarray(equal).reshape(-1), np.arange(len(q)), np.cumsum(moved))
+    values, number = np.unique(q.reshape(len(q), -1), axis=0, return_inverse=True)
+    tree = scipy.spatial.cKDTree(values)
+    apart = tree.query(values, 2, p=np.inf, distance_upper_bound=AT_REST)[0][:, 1]
+    first = np.arange(len(values))
+    for i in np.flatnonzero(np.isfinite(apart)):
+        if first[i] == i:
+            near = np.array(tree.query_ball_point(values[i], AT_REST, p=np.inf))
+            first[near[first[near] == near]] = i
+    return np.unique(first[number.reshape(-1)], return_inverse=True)[1]
 
 
 def _united(group: np.ndarray, rows: np.ndarray, keys: np.ndarray) -> np.ndarray:

@@ -36,8 +36,8 @@ def read_data(
 
     Every column's name carries its unit: ``label, q1_deg, ..., x_mm, y_mm, z_mm``. Optional columns are
 
-    - ``label``; ``configuration`` (rows of one stay together; rows with equal joint values by default, and
-      consecutive ones in which the arm stood still);
+    - ``label``; ``configuration`` (rows of one stay together; rows whose joint values differ by no more than
+      0.1 mrad or 0.1 mm by default);
     - ``marker`` (which reflector); ``fixture`` (which anchor, plane or sphere); ``point``
       or ``plane`` (which one was touched); ``session`` (any text: rows of one share an error of the registration);
     - ``sigma_mm``, ``sigma_x_mm`` (standard deviations of a row, of one component), ``u95_mm``, ``u95_x_mm``
