@@ -29,7 +29,7 @@ from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors
-from rpim_opt.calibration.verdict import Verdict, ambiguous_deviation, kept_rows, refuse_misread, scatter
+from rpim_opt.calibration.verdict import Verdict, ambiguous_deviation, refuse_misread, scatter
 from rpim_opt.calibration.words import VAGUE, underdetermined
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut, Requirement
@@ -225,7 +225,7 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
     """Return a warning if U exceeds the error of the nominal robot, or readings scatter; otherwise an empty text."""
     if not (of_positions(result) and result.verdict.delivered):
         return ""
-    if scatter(result, kept_rows(result)):
+    if scatter(result):
         return "Inconclusive: check the condition below before using this robot."
     name, errors, _ = headline_errors(result)
     nominal = rms(errors)

@@ -183,21 +183,20 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     stretch, sigmas = _stretch(result)
     scaled = [_like_a_scale(result, stretch)] * (abs(stretch) > UNSCALED and sigmas > SIGMAS)
     ambiguous = [] if scaled else [ambiguous_deviation(result)]
-    kept = kept_rows(result)
     conditions = (mapping, result.contradiction, *ambiguous, *_little_motion(result))
     caution = " ".join(filter(None, conditions))
     limited = tuple(text for text in causes if LIMITED in text)
     if limited:
         return Verdict((*limited, *_worse(result)), caution)
     reasons = [] if result.converged else [result.message]
-    reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result, bool(causes)), *scaled]
-    out = {*np.array(result.problem.labels)[~kept].tolist(), *(row.label for row in result.left_out)}
+    reasons += [*_residuals(result), *_repeatability(result), *_deviations(result, bool(causes)), *scaled]
+    out = {*np.array(result.problem.labels)[~kept_rows(result)].tolist(), *(row.label for row in result.left_out)}
     rows = len(out.union(result.problem.labels))
     if len(out) > EXCLUDED * rows:
         reasons.append(f"{len(out)} of {rows} rows are outliers, more than {EXCLUDED:.0%}.")
     reasons += [*_worse(result), *_computed(result), *causes]
     if not reasons:
-        caution = " ".join(filter(None, (caution, scatter(result, kept))))
+        caution = " ".join(filter(None, (caution, scatter(result))))
     return Verdict(tuple(dict.fromkeys(reasons)), caution)
 
 
@@ -220,9 +219,9 @@ def ambiguous_deviation(result: Outcome) -> str:
     )
 
 
-def scatter(result: Outcome, kept: np.ndarray) -> str:
-    """Return a sentence if rows, kept (N,), scatter as no industrial robot does; unless repeated ones show it does."""
-    size, ratio = residual_rms(result, kept)["length"]
+def scatter(result: Outcome) -> str:
+    """Return a sentence if rows scatter as those of no industrial robot do; unless repeated ones show that it does."""
+    size, ratio = residual_rms(result)["length"]
     most = REPEATABLE * arm_length(result.problem)
     blocks = result.problem.sample().data.blocks
     if ratio <= NOISY or size <= most or sum(len(block.row) - repeated(block).max() - 1 for block in blocks) >= FEWEST:
@@ -260,7 +259,7 @@ def _stretch(result: Outcome) -> tuple[float, float]:
     """Return the common deviation of lengths, as by a wrong scale, in stated standard deviations, too; 0 for none."""
     free, C = result.problem.parameters.free, result.known_covariance
     # of rows that do not fit, and of another robot, deviations say nothing
-    if C is None or any(_residuals(result, kept_rows(result))) or any(_deviations(result)):
+    if C is None or any(_residuals(result)) or any(_deviations(result)):
         return 0.0, 0.0
     lengths = (np.array(free.dimensions) == "length") & ~free.of_frames & (free.nominal != 0) & np.isfinite(np.diag(C))
     if lengths.sum() < LENGTHS:
@@ -334,8 +333,9 @@ def kept_rows(result: Outcome) -> np.ndarray:
     return ~np.isin(result.problem.labels, [flag.label for flag in out])
 
 
-def residual_rms(result: Outcome, kept: np.ndarray) -> dict[str, tuple[float, float]]:
-    """Return the RMS residual [SI] of rows, kept (N,), and its ratio to the stated noise, by dimension."""
+def residual_rms(result: Outcome) -> dict[str, tuple[float, float]]:
+    """Return the RMS residual [SI] of `kept_rows`, and its ratio to the stated noise, by dimension."""
+    kept = kept_rows(result)
     errors = {each: np.where(kept, result.errors(dimension=each), np.nan) for each in UNITS}
     return {each: (rms(error), noise_ratio(result.problem, error, each)) for each, error in errors.items()}
 
@@ -393,9 +393,9 @@ def worse_than_nominal(nominal: Array, identified: Array, rows: str = "") -> str
 # --- reasons ------------------------------------------------------------------------------------------------------
 
 
-def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
+def _residuals(result: Outcome) -> Iterator[str]:
     """Say that residuals are beyond what instrument and robot make of them; of a camera in pixels and at the arm."""
-    residuals = residual_rms(result, kept)
+    residuals = residual_rms(result)
     checked = _overdetermined(result)
     for each, (size, ratio) in residuals.items():
         nominal = noise_ratio(result.problem, result.nominal_errors(dimension=each), each)  # with frames fitted
@@ -470,7 +470,7 @@ def _cause(result: Outcome, i: int, largest: float) -> str:
     C = result.known_covariance
     if not penalized and C is not None and C[i, i] > largest**2:
         return "Neither the data nor a penalty determine it: add a penalty on it, or do not identify it."
-    if not any(_residuals(result, kept_rows(result))):
+    if not any(_residuals(result)):
         return (
             "The data fit with that: check the robot file for misprints, and whether it is of this model (in a "
             "standard DH table a and alpha stand in the row before)."
@@ -574,8 +574,7 @@ def likely_causes(result: Outcome) -> list[str]:
     if not result.problem.keeps_rows:
         return known
     problem = cast(CalibrationProblem, result.problem)
-    kept = kept_rows(result)
-    residuals = residual_rms(result, kept)
+    residuals = residual_rms(result)
     noticed = max(ratio for _, ratio in residuals.values()) > NOTICED
     signs = [*_large_residuals(result, residuals), *_large_deviations(result)]
     head = [f"{BAD}: {'; '.join(signs)}."] if signs else []
@@ -590,7 +589,7 @@ def likely_causes(result: Outcome) -> list[str]:
     elif signs or not result.converged:
         explanations = [
             _held(result, problem),
-            _limited_by_formulation(result, problem, kept),
+            _limited_by_formulation(result, problem),
             _other_readings(result, problem, ordered),
         ]
         if any(_deviations(result)):  # a table that is read wrongly makes no robot; of another one a frame may be wrong
@@ -643,7 +642,7 @@ def _beside_a_good_fit(
         return causes, []
     if len(problem.arms) > 1:
         return [], together
-    limits = [*_held(result, problem), *_limited_by_formulation(result, problem, kept)] if noticed else []
+    limits = [*_held(result, problem), *_limited_by_formulation(result, problem)] if noticed else []
     if limits:
         return [], [*(f"{BAD}: residuals; {text}" for text in limits), *together]
     alone, x = _without_outliers(result, ordered, again=noticed)
@@ -714,10 +713,11 @@ def _held(result: Outcome, problem: CalibrationProblem) -> Iterator[str]:
         )
 
 
-def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: np.ndarray) -> Iterator[str]:
+def _limited_by_formulation(result: Outcome, problem: CalibrationProblem) -> Iterator[str]:
     """Say that loss, penalty or constraints leave what a squared penalty at weight 1 explains of the same rows."""
     if result.record.earlier:  # whose prior is what was known
         return
+    kept = kept_rows(result)
     if kept.mean() < 1 - EXCLUDED:  # downweighted by a fit that is wrong everywhere
         kept = np.ones_like(kept)
     rows, x = problem.on(problem.data.take(np.flatnonzero(kept))), result.x
@@ -789,7 +789,7 @@ def _other_readings(result: Outcome, problem: CalibrationProblem, ordered: Calib
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
         yield from rows_without_values(problem.data, problem.arms)
         return
-    explained = max(ratio for _, ratio in residual_rms(result, kept_rows(result)).values()) < NOTICED
+    explained = max(ratio for _, ratio in residual_rms(result).values()) < NOTICED
     most = REACH * arm_length(problem) if explained else np.inf  # else wrong lengths explain more
     # beside single rows, which may be the ones where something changed
     parts = of_sessions(ordered)
