@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -204,33 +204,43 @@ def _few_common(joints: CanonicalTable, values: CanonicalTable, key: Key, count:
 
 
 def _key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Key:
-    """Return the key as stated, else the label, the only column that both have, or columns of the same values."""
+    """Return the key as stated, else the first of `_keys`."""
     pairs = _pairs(joints, values, key)
     telling = [pair for pair in pairs if not counts_rows(pair.left)]
-    pair = _only(telling or pairs)
     if key == "row":
-        return _row_numbers(joints, values, pair if telling else None)
+        return _row_numbers(joints, values, _only(telling))
     common = [name for name in joints.raw if name in values.raw]
     common = [name for name in common if name == key.lower() or not COUNTER.fullmatch(name)]
-    stated = key.lower() or (None if telling and pair else _only(common))
-    labels = _normal(joints.columns.get("label", ()))
-    chosen = None
-    if key in ("", "label") and not (telling and counts_rows(labels)):  # numbers of rows, where others match
-        sides = (_normal(values.columns.get(column, ())) for column in ("label", "configuration"))
-        keys = (_keyed("label", (), labels, side) for side in sides)
-        chosen = next((each for each in keys if {*labels} & {*each.right}), None)
-    if not chosen and stated in common:
-        chosen = _keyed(f"column '{stated}'", (stated,), _normal(joints.raw[stated]), _normal(values.raw[stated]))
-    if not chosen and not pairs:  # names that differ, with the same numbers
-        pair = _only(_pairs(joints, values, key, numbers=True))
-    if chosen or pair:
-        return chosen or pair
+    for chosen in _keys(joints, values, key, common, telling or pairs):
+        return chosen
     found = f"{', '.join(common) or 'no column'} in both {joints.file} and {values.file}"
     if key:
         found = f"'{key}', whose values no column of the other file has"
     for side in (joints, values):
         found += "".join(f"; {name} of {side.file}: {listed(keys, 3)}" for name, keys in _naming(side).items())
     raise InputError("--key", found, f"--key with a column of common values, {OTHER_KEYS}")
+
+
+def _keys(
+    joints: CanonicalTable, values: CanonicalTable, key: str, common: Sequence[str], pairs: Sequence[Key]
+) -> Iterator[Key]:
+    """Yield the label, the only ``common`` column, the only two columns of the same values, or numbers in these.
+
+    Where columns of the same values tell rows apart (``pairs``), the label that only counts them does not.
+    """
+    counted = all(counts_rows(pair.left) for pair in pairs)
+    labels = _normal(joints.columns.get("label", ()))
+    if key in ("", "label") and (counted or not counts_rows(labels)):
+        for column in ("label", "configuration"):
+            other = _keyed("label", (), labels, _normal(values.columns.get(column, ())))
+            if {*labels} & {*other.right}:
+                yield other
+    stated = key.lower() or (_only(common) if counted or len(pairs) > 1 else None)
+    if stated in common:
+        yield _keyed(f"column '{stated}'", (stated,), _normal(joints.raw[stated]), _normal(values.raw[stated]))
+    same = pairs or _pairs(joints, values, key, numbers=True)
+    if len(same) == 1:
+        yield same[0]
 
 
 def _only(items: Sequence[Any]) -> Any:
