@@ -594,10 +594,7 @@ def likely_causes(result: Outcome) -> list[str]:
         ]
         if any(_deviations(result)):  # a table that is read wrongly makes no robot; of another one a frame may be wrong
             explanations.insert(0, explanations.pop())
-        causes = [
-            *first(*explanations, _residual_causes(result, problem, ordered)),
-            *computed_columns(problem),
-        ]
+        causes = first(computed_columns(problem), *explanations, _residual_causes(result, problem, ordered))
         ignored = result.record.details.get("ignored_joints")
         if ignored:
             state = "state another robot, or a tip link beyond these joints (--urdf-tip), if they move the tool"

@@ -172,6 +172,18 @@ def moved_otherwise(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     return changed
 
 
+def sum_and_difference(q: np.ndarray) -> np.ndarray:
+    """Read the two motors of a differential that moves joints 5 and 6."""
+    q[..., [4, 5]] = q[..., [4, 4]] + q[..., [5, 5]] * [1, -1]
+    return q
+
+
+def without_thousands(y: np.ndarray) -> np.ndarray:
+    """Read ``1.234,5`` mm as 1.2345, in a frame in which half of x is above a metre."""
+    y = y - [np.median(y[:, 0]) - 1, 0, 0]
+    return np.where((np.abs(y) >= 1) & (np.arange(3) == 0), 1e-3 * y, y)
+
+
 def angles_exchanged(y: np.ndarray) -> np.ndarray:
     """Compute positions, seen from 1.5 m away, with azimuths as elevations."""
     ahead = y + np.array([1.5, 0.0, 0.0])
@@ -308,6 +320,12 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     "a lens": (
         values(lambda y: y + 0.02 * (y - y.mean(axis=0)) * np.sum((y - y.mean(axis=0)) ** 2, axis=1, keepdims=True)),
         "with the cube of their distance",
+    ),
+    "columns of a differential": (joints(sum_and_difference), "q5 and q6 that are sum and difference"),
+    "thousands read as decimals": (values(without_thousands), "values of column x above 1000 mm read as a thousandth"),
+    "the reflector before the last joint": (
+        moved_otherwise(lambda q: q * (np.arange(q.shape[-1]) < q.shape[-1] - 1)),
+        "standing still in all rows, or the reflector on the link of joint",
     ),
     "the reflector on link 4": (
         moved_otherwise(lambda q: q * (np.arange(q.shape[-1]) < 4)),

@@ -77,6 +77,9 @@ QUICK = {
         "azimuths and elevations exchanged",
         "a lens",
         "columns a and d exchanged",
+        "columns of a differential",
+        "thousands read as decimals",
+        "the reflector before the last joint",
         "another robot",
     ],
     "irb120": [
@@ -1090,6 +1093,21 @@ def test_columns_that_few_rows_fit_exactly_do_not_tell_the_noise_of_another() ->
     gross[:3] = 0.01 * np.random.default_rng(3).normal(size=(3, 3))
     result = ro.calibrate(values(lambda y: y + gross)(simulated_arm("ur5", 3, 10)))
     assert "residuals of column" not in str(result.verdict)
+
+
+def test_orientations_that_the_controller_computed_are_named() -> None:
+    """Backlash was found in what they contradict."""
+    problem = ro.load("pose").problem
+
+    def computed(y: np.ndarray) -> np.ndarray:
+        flange = ro.robot.forward_kinematics(problem.robot, problem.data.q)[:, :3, :3]
+        base, tool = Rotation.from_rotvec([[0.3, -0.2, 1.1], [0.1, 0.0, 0.2]])
+        return np.column_stack([y[:, :3], (base * Rotation.from_matrix(flange) * tool).as_quat(scalar_first=True)])
+
+    result = ro.calibrate(values(computed)(problem))
+    (cause,) = [each for each in likely_causes(result) if each.startswith("Likely: ")]
+    assert cause.startswith("Likely: orientations agree with the nominal robot to")
+    assert not result.verdict.delivered
 
 
 def test_misread_orientations_are_named() -> None:

@@ -483,6 +483,8 @@ def test_three_readings_side_by_side_are_rows_of_one_configuration(tmp_path: Pat
     assert found.columns["q1_deg"] == ["1", "1", "3", "3", "5", "5"]
     data = ro.read_data(found.columns, ARM, {"position_mm": 0.05})
     assert data.configuration.tolist() == [0, 0, 1, 1, 2, 2]
+    failed = read(write(tmp_path, head + rows.replace("402,96.2,7", ",,")))
+    assert failed.columns["label"] == ["A/1", "A/2", "B/1", "C/1", "C/2"]
     with pytest.raises(ro.InputError, match="another point or reading"):
         read(write(tmp_path, head + rows.replace("401.1", "421.1")))
 

@@ -181,9 +181,16 @@ def test_an_index_of_the_link_before_says_that_it_is_modified(tmp_path: Path, he
             'L(4) = Link([0 0.42 0 pi/2], "standard");\nL(5) = Revolute(\'alpha\', -pi/2);\n'
             "L(6) = Link('revolute', 'd', 0.08);\nrobot = SerialLink(L, 'name', 'KR 6');\n",
         ),
+        (
+            "toolbox.py",
+            "from math import pi  # RevoluteDH(d=1) was tried first\nrobot = DHRobot([\n"
+            "    RevoluteDH(d=0.4, a=0.025, alpha=-pi/2), RevoluteDH(a=0.455),\n"
+            "    RevoluteDH(a=0.035, alpha=-np.pi / 2, offset=-pi/2, qlim=[-pi, pi]),\n"
+            "    DHLink(d=0.42, alpha=pi/2), RevoluteDH(alpha=-pi/2), RevoluteDH(d=0.08)], name='KR 6')\n",
+        ),
     ],
     ids=["a joint a column", "Markdown, parts of pi", "a box of lines", "a unit above the header", "names of angles",
-         "a script for the Robotics Toolbox"],
+         "a script for the Robotics Toolbox", "one in Python"],
 )  # fmt: skip
 def test_a_sheet_as_people_write_it_is_the_robot(tmp_path: Path, name: str, content: str) -> None:
     (tmp_path / name).write_text(content, encoding="utf-8")
@@ -203,6 +210,8 @@ MODIFIED = (
     ("name", "content"),
     [
         ("scara.m", MODIFIED),
+        ("scara.py", "[RevoluteMDH(d=0.3), PrismaticMDH(theta=pi/2, a=0.3, alpha=pi, offset=0.1),\n"
+         "DHLink(sigma=1, offset=0.2, mdh=True)]"),
         ("scara.csv", "type,theta [deg],d [m],a [m],alpha [deg],convention\nR,0,0.3,0,0,Craig\n"
          "LIN,90,0.1,0.3,180,Craig\n"
          "T,0,0.2,0,0,Craig\n"),

@@ -152,7 +152,8 @@ def _readings_below_each_other(raw: RawTable) -> RawTable:
         return raw
     values = np.array([[numeral(str(cell)) for cell in raw.columns[of[each]]] for each in sorted(of)])
     values = values.reshape(count, 3, -1)
-    if not np.ptp(values, axis=0).max() < NEAR_READINGS * values.std(axis=2).max():
+    apart = np.fmax.reduce(values) - np.fmin.reduce(values)  # of those that were taken
+    if not np.nanmax(apart) < NEAR_READINGS * np.nanstd(values, axis=(0, 2)).max():
         return raw
     columns: dict[str, Sequence[Any]] = {}
     for name, cells in raw.columns.items():

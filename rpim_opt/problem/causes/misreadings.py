@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import combinations, permutations, product
+from itertools import combinations, pairwise, permutations, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -180,7 +180,7 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
             remedy = f'write type = "prismatic" for it in robot.toml, and name its column q{i + 1}_mm'
             sliding = replace(robot, joint_types=tuple(kinds))
             yield _with_robot(f"{joint} prismatic and its values mm", remedy, sliding, DEGREES_PER_MM ** -eye[i])
-    for i, last in enumerate(map(robot.joint, range(robot.dof - 2)), start=1):
+    for i, last in enumerate(map(robot.joint, range(robot.dof - 1)), start=1):
         remedy = f"put it on the last link, or describe the robot up to joint {last}"
         before = np.diag(np.arange(robot.dof) < i).astype(float)
         yield _joints(f"the reflector on the link of joint {last} (later joints do not move it)", remedy, before)
@@ -199,6 +199,13 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
             sum_of = f"q{i + 1} {'plus' if factor > 0 else 'minus'} {size}q{j + 1}"
             what = f"joint {robot.joint(i)} coupled to joint {robot.joint(j)} ({sum_of})"
             yield _joints(what, coupling(robot.joint_map @ M), M)
+    for (i, j), size, side in product(pairwise(np.flatnonzero(turning)), (0.5, 1.0), (1.0, -1.0)):
+        M = eye.copy()
+        M[np.ix_([i, j], [i, j])] = size * np.array([[1, 1], [side, -side]])
+        what = (
+            f"columns q{i + 1} and q{j + 1} that are sum and difference of joints {robot.joint(i)} and {robot.joint(j)}"
+        )
+        yield _joints(f"{what} (a differential)", coupling(robot.joint_map @ M), M)
     own = set(zip(robot.leading, range(robot.dof), strict=True))
     coupled = product(range(len(robot.mdh)), range(robot.dof)) if len(robot.mdh) > robot.dof else ()
     for (i, j), factor in product(sorted({*coupled} - own), (-1, 0, 1)):
@@ -282,6 +289,13 @@ def _of_positions(points: Points) -> Iterator[Misreading]:
         polar = np.column_stack([np.arcsin(z / np.maximum(distance, 1e-12)), np.arctan2(y, x), distance])
         return replace(points, y=from_elevation(polar))
 
+    def with_thousands(k: int, points: Points) -> Points:
+        small = (np.arange(3) == k) & (np.abs(points.y) >= 1e-3) & (np.abs(points.y) < 1e-2)
+        return replace(points, y=np.where(small, 1e3 * points.y, points.y))
+
+    for k, axis in enumerate("xyz"):
+        what = f"values of column {axis} above 1000 mm read as a thousandth (1.234,5 as 1.2345)"
+        yield Misreading(what, "export them without separators of thousands", partial(with_thousands, k))
     yield Misreading("azimuths and elevations exchanged", "exchange the names of these columns", from_other_angle)
     for side in (1.0, -1.0):
         remedy = "name the column zenith_deg in place of elevation_deg, or vice versa"

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import bdtrc
 
 from rpim_opt.basics.arrays import Array, rms
@@ -42,6 +43,7 @@ FLAT_TURN = 0.05
 MOST_ROUNDS = 20  # of fitting one joint's values
 COMPUTED = "were they computed, not measured? Leave them out ([exclude])."
 MOSTLY = 2 / 3  # share of the rows from one to another that is of one kind, for a change to have come there
+EXACT_TURN = 3e-5  # what no measured orientation comes up to [rad], nor a robot
 LINEAR = 13  # coefficients of a coordinate by position and rotation of the flange
 
 
@@ -53,14 +55,25 @@ def single_rows(problem: CalibrationProblem) -> Iterator[str]:
 
 
 def computed_columns(problem: CalibrationProblem) -> Iterator[str]:
-    """Report coordinates that are exact functions of the nominal robot: computed, not measured.
+    """Report coordinates or orientations that are exact functions of the nominal robot: computed, not measured.
 
-    A coordinate of a point in any frame, of any reflector, is linear in position and rotation of the nominal flange.
+    A coordinate of a point in any frame, of any reflector, is linear in position and rotation of the nominal flange. In
+    any frame, of any tool, orientations turn by the same angle from row to row.
     """
     points = points_of(problem)
-    if points is None or points.by_camera or len(points.row) < 2 * LINEAR or len(points.tools) > 1:
+    if points is None or points.by_camera or len(points.row) < FEWEST:
         return
     T = forward_kinematics(points.robot, points.q)
+    if points.turns is not None:
+        angles = [
+            Rotation.from_matrix(R[1:] @ R[:-1].transpose(0, 2, 1)).magnitude() for R in (points.turns, T[:, :3, :3])
+        ]
+        apart = rms(angles[0] - angles[1])
+        if apart < EXACT_TURN:
+            agree = f"orientations agree with the nominal robot to {three_digits(1e3 * apart)} mrad"
+            yield f"{agree}: were they computed, not measured? Use the positions alone (measurement = 'position')."
+    if len(points.row) < 2 * LINEAR or len(points.tools) > 1:
+        return
     X = np.column_stack([T[:, :3, 3], T[:, :3, :3].reshape(len(T), 9), np.ones(len(T))])
     left = points.y - X @ np.linalg.lstsq(X, points.y, rcond=None)[0]
     exact = np.sqrt(np.sum(left**2, axis=0) / (len(X) - LINEAR)) < np.minimum(EXACT, WRONG * points.y.std(axis=0))
@@ -125,7 +138,8 @@ def unrelated_rows(problem: CalibrationProblem, error: float) -> Iterator[str]:
     yield (
         f"joint values hardly explain the measured positions (residual RMS {three_digits(1e3 * error)} mm, spread "
         f"{three_digits(1e3 * spread)} mm, that of the nominal flange {three_digits(1e3 * flange)} mm): do the rows of "
-        "the two tables match? Join them by a common column, or by time. Or were deviations exported, not positions?"
+        "the two tables match, and are all joints' columns of one log? Join them by a common column, or by time. Or "
+        "were deviations exported, not positions?"
     )
 
 

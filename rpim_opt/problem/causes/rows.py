@@ -347,9 +347,9 @@ def _unit(values: Array, *steps: float) -> Array:
 
 
 def _step(values: Array) -> float:
-    """Return the step of the decimal grid that values are on, up to 4 decimals; 0 where they are on none."""
+    """Return the step of the decimal grid that values are on, up to 4 decimals; 0 if on none, or all are equal."""
     decimals = decimals_of(values)
-    if decimals is None:
+    if decimals is None or not np.ptp(values):
         return 0.0
     return float(np.gcd.reduce((values * 10.0**decimals).round().astype(int))) / 10.0**decimals
 

@@ -1,8 +1,9 @@
-"""Links of a script for the Robotics Toolbox for MATLAB, as a DH table in rad and m; base and tool are left out.
+"""Links of a script for the Robotics Toolbox, as a DH table in rad and m; base and tool are left out.
 
-``L(1) = Link([theta d a alpha sigma offset], 'modified')``, ``Link('d', 0.4, 'a', 0.025, 'alpha', -pi/2)``,
-``Revolute(...)``, ``PrismaticMDH(...)``: what is not called modified is in the standard convention. The joint's own
-variable is not read: where it begins is the offset.
+Of MATLAB ``L(1) = Link([theta d a alpha sigma offset], 'modified')``, ``Link('d', 0.4, 'a', 0.025, 'alpha', -pi/2)``,
+``Revolute(...)``, ``PrismaticMDH(...)``, of Python ``RevoluteDH(d=0.4, a=0.025, alpha=-pi/2)``, ``PrismaticMDH(...)``,
+``DHLink(...)``: what is not called modified is in the standard convention. The joint's own variable is not read: where
+it begins is the offset.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.layout import RawTable
 from rpim_opt.basics.tables import decoded
 
-LINK = re.compile(r"\b(Link|Revolute|Prismatic)(MDH)?\s*\(((?:[^()]|\([^()]*\))*)\)")
-NAMED = re.compile(r"'(\w+)'\s*,\s*([^\s,'][^,']*)")
+LINK = re.compile(r"\b(?:DH)?(Link|Revolute|Prismatic)(?:(MDH)|DH)?\s*\(((?:[^()]|\([^()]*\))*)\)")
+NAMED = re.compile(r"\b(\w+)(?:'\s*,|\s*=)\s*([^\s,'][^,']*)")
+MODIFIED = re.compile(r"'modified'|\bmdh\s*=\s*(True|1)\b")
 ORDER = ("theta", "d", "a", "alpha", "sigma", "offset")
 HEADERS = {"theta": "theta [rad]", "d": "d [m]", "a": "a [m]", "alpha": "alpha [rad]", "sigma": "type",
            "convention": "convention"}  # fmt: skip
@@ -23,7 +25,7 @@ HEADERS = {"theta": "theta [rad]", "d": "d [m]", "a": "a [m]", "alpha": "alpha [
 
 def read_links(path: Path) -> RawTable:
     """Return the table of a script's links, in their order."""
-    text = re.sub(r"\.\.\.[^\n]*\n|%[^\n]*", "", decoded(path)[0]).replace('"', "'")
+    text = re.sub(r"\.\.\.[^\n]*\n|[%#][^\n]*|\b(?:np|numpy|math)\.", "", decoded(path)[0]).replace('"', "'")
     columns: dict[str, list[str]] = {header: [] for header in HEADERS.values()}
     for kind, craig, inside in LINK.findall(text):
         vector = re.match(r"\s*\[([^\]]*)\]", inside)
@@ -36,10 +38,10 @@ def read_links(path: Path) -> RawTable:
         slides = kind == "Prismatic" or "'prismatic'" in inside or (not vector and "theta" in stated)
         values = {**dict.fromkeys(ORDER, "0"), "sigma": f"{slides:d}", **stated}
         values["theta" if values["sigma"].strip() == "0" else "d"] = values["offset"]
-        values["convention"] = "modified" if craig or "'modified'" in inside else "standard"
+        values["convention"] = "modified" if craig or MODIFIED.search(inside) else "standard"
         for name, header in HEADERS.items():
             columns[header].append(values[name].strip())
     if not columns["convention"]:
-        accepted = "L(1) = Link([theta d a alpha], 'modified'), ..."
+        accepted = "L(1) = Link([theta d a alpha], 'modified'), ..., or RevoluteMDH(d=0.4, alpha=pi/2), ..."
         raise InputError("the file", "no link of the Robotics Toolbox", accepted)
     return RawTable(columns)

@@ -27,7 +27,7 @@ from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
 READY = Path(__file__).resolve().parents[1] / "ready"
-SHEETS = (".csv", ".tsv", ".txt", ".md", ".xlsx", ".m")  # endings of tables with one row per joint
+SHEETS = (".csv", ".tsv", ".txt", ".md", ".xlsx", ".m", ".py")  # endings of tables with one row per joint
 WRITTEN = (".toml", ".json", ".csv")  # endings of what is written
 LIMITS = ("lower", "upper")
 CENTRE = ("centre_x", "centre_y", "centre_z")
@@ -228,7 +228,7 @@ def read_sheet(path: Path, convention: str = "", units: Mapping[str, str] = Mapp
         modified   Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)
         standard   Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta)
     """
-    if path.suffix.lower() == ".m":
+    if path.suffix.lower() in (".m", ".py"):
         raw = read_links(path)
     else:
         raw = read_table(path, turned=lambda grid: {"alpha", "a", "d"} <= {_stem(row[0])[0] for row in grid.rows})
