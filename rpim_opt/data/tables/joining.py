@@ -235,9 +235,10 @@ def _keys(
             other = _keyed("label", (), labels, _normal(values.columns.get(column, ())))
             if {*labels} & {*other.right}:
                 yield other
-    stated = key.lower() or (_only(common) if counted or len(pairs) > 1 else None)
-    if stated in common:
-        yield _keyed(f"column '{stated}'", (stated,), _normal(joints.raw[stated]), _normal(values.raw[stated]))
+    stated = [name for name in common if name == key.lower()] if key else common
+    if len(stated) == 1 and (key or counted or len(pairs) > 1):
+        (name,) = stated
+        yield _keyed(f"column '{name}'", (name,), _normal(joints.raw[name]), _normal(values.raw[name]))
     same = pairs or _pairs(joints, values, key, numbers=True)
     if len(same) == 1:
         yield same[0]
