@@ -17,7 +17,7 @@ from rpim_opt.basics.text import counted, joined, table, three_digits
 from rpim_opt.basics.units import display, printed
 from rpim_opt.bayes.model_selection import deviations, named
 from rpim_opt.bayes.prior import Prior
-from rpim_opt.bayes.prior_terms import default_widths
+from rpim_opt.bayes.prior_terms import Statement, default_widths, nested
 from rpim_opt.calibration.held_out import displacement, registered, registration
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.lack_of_fit import TOGETHER, judged
@@ -48,6 +48,7 @@ MULTIPLES = (1.0, 3.0, 10.0, 30.0)  # multiples of a deviation's prior width tha
 UNCHANGED = 0.5  # prior probability that nothing changed; the other half is dealt out to the kinds of causes in use
 OUTLIER_WIDTH = 10.0  # standard deviations by which an outlier is off, times `MULTIPLES`
 UNOBSERVABLE = 1e-9  # part of the largest eigenvalue below which readings do not observe a direction of a change
+STAYING = 1e-2  # scales by which an update changes combinations of parameters that no configuration shows
 MOST = 4  # changes of robot and frames that are looked for one after the other: of more it is another robot
 SPARED = 0.25  # part of the readings that may be wrong
 STRANGE = 5.0  # times the error before any calibration by which readings that no change explains are another robot's
@@ -582,8 +583,39 @@ def posterior_as_prior(
         without = tuple(name for name in released if name in known)
         # in units of the declared noise, as the new readings are: weight 1 then joins both
         prior = Prior.from_result(result, inflation, without, noise=1.0) & prior
+    rows = _staying(problem, x, released)
+    if len(rows):
+        values = tuple((rows @ x).tolist())
+        prior = prior & Prior(statements=(Statement(free.names, free.dimensions, nested(rows), values),))
     plain = replace(result.formulation, penalty=SQUARES, penalty_over=None)
     return prior.stated(problem.parameters, widened=False).penalized(plain)
+
+
+def _staying(problem: Source, x: Array, released: Sequence[str]) -> Array:
+    """Return combinations (k, n) [1 / SI] of deviations at x (n,) [SI] that no configuration shows, and that stay.
+
+    A turn of the base and one of joint 1 are such: the posterior is as wide as the prior there, with constant slopes,
+    and in the curvature of what follows (a turn by g moves points by g^2) new readings would fit their noise. Of
+    released parameters all others are held, so that these take the change.
+    """
+    if not isinstance(problem, CalibrationProblem):
+        return np.zeros((0, len(x)))
+    free, data = problem.parameters.free, problem.data
+    rng = np.random.default_rng(0)
+    slopes = []
+    for _ in range(-(-2 * len(free) // len(data))):
+        blocks = tuple(replace(block, q=block.q + rng.uniform(-1, 1, block.q.shape)) for block in data.blocks)
+        slopes.append(problem.on(replace(data, blocks=blocks)).linearize(x).A)
+    s, V = np.linalg.svd(np.vstack(slopes), full_matrices=False)[1:]
+    rows = V[s <= UNOBSERVABLE * s[0]] * ~np.isin(free.names, list(released))
+    s, V = np.linalg.svd(rows, full_matrices=False)[1:]
+    return V[s > RANK_TOLERANCE] / (STAYING * free.scale)
+
+
+def _opened(C: Array, rows: Array) -> Array:
+    """Return D (n, k), C + D D' = (C^-1 - R'R)^-1: the covariance (n, n) without the information of rows R (k, n)."""
+    left, U = np.linalg.eigh(np.eye(len(rows)) - rows @ C @ rows.T)
+    return C @ rows.T @ U / np.sqrt(np.maximum(left, RANK_TOLERANCE))
 
 
 def prior_widths(result: Calibration, problem: Source) -> Array:
@@ -615,6 +647,8 @@ def _recalibrated(
             local=np.append(learned.local, np.ones(len(more))),
             drift=np.zeros((len(updated.x), 0)),  # the prior holds what was not known of the scales
         )
+        held = replace(updated, learned=learned).covariance
+        learned = replace(learned, drift=_opened(held, _staying(problem, updated.x, released)))
     return replace(updated, learned=learned, calibrate_again=partial(calibrate, formulation=formulation, weight=1.0))
 
 
