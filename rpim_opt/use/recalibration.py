@@ -305,9 +305,7 @@ def _in_turn(
     first: Weighed | None = None
     while True:
         updated = _recalibrated(result, problem, released, inflation, start)
-        # a fit without a change spreads it over what is hardly known, and leaves the range of its slopes
-        at = updated.x if released or changes else previous_deviations(result, updated.problem)
-        causes, after = _weighed(result, updated.problem, at, updated.formulation, released)
+        causes, after = _weighed(result, updated.problem, updated.x, updated.formulation, released)
         first = first or (causes, after)
         # the most probable of the causes that chance does not explain
         cause = next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)

@@ -168,6 +168,24 @@ def test_nothing_is_accused_where_nothing_changed() -> None:
     assert str(found).startswith("No change of the robot is detectable from 8 readings")
 
 
+def test_what_no_configuration_shows_stays() -> None:
+    """Zeros that are far off leave joint 1 and the base open by 10 mrad: they moved by 1.1, of an unchanged robot."""
+    rng = np.random.default_rng(500)
+    robot, q = ro.read_robot("ur5e"), rng.uniform(-2.2, 2.2, (50, 6))
+    base, tool = np.array([1.5, 0.4, -0.3, *rng.uniform(-0.02, 0.02, 2), 0.5]), np.array([0.05, 0.03, 0.1, 0, 0, 0])
+    nominal = ro.problem_from(robot, ro.Dataset.of(q, np.zeros((50, 3)), 2e-5), base=base, tool=tool)
+    free = nominal.parameters.free
+    size = np.where(np.array(free.dimensions) == "length", 5e-4, 1.5e-3) * ~free.of_frames
+    size[[name.startswith("theta") for name in free.names]] = 6e-3
+    y = -nominal.residual(rng.normal(size=len(size)) * size).reshape(-1, 3) + 3e-5 * rng.normal(size=(50, 3))
+    first = ro.calibrate(ro.problem_from(robot, ro.Dataset.of(q[:40], y[:40], 2e-5)))
+    found = ro.use.update(first, ro.Dataset.of(q[40:], y[40:], 2e-5)).result
+    was, now = (each.problem.parameters.by_name(each.x) for each in (first, found))
+    assert abs(now["theta1"] - was["theta1"]) < 1e-5
+    i = free.names.index("theta1")
+    assert found.covariance[i, i] == pytest.approx(first.covariance[i, i], rel=0.1)
+
+
 def test_a_wrong_reading_is_no_change_of_the_robot() -> None:
     robot = happened(6)
     block = robot.after.blocks[0]
