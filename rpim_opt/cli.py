@@ -510,7 +510,8 @@ def update(
         )
         updated = recalibration.result
         updated = replace(updated, record=replace(updated.record, files={file.name: sha256_of(file) for file in data}))
-    return Output(recalibration, recalibration.content(), int(not recalibration.delivered), _saved(updated, out), read)
+    code = int(not updated.verdict.delivered)
+    return Output(recalibration, recalibration.content(), code, _saved(updated, out), read)
 
 
 @command

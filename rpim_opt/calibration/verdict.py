@@ -173,11 +173,11 @@ class Verdict:
 def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     """Return the verdict on a calibration, with likely input mistakes, one sentence each.
 
-    Not delivered is a robot whose fit did not converge; whose residuals without outliers are beyond 3 times the stated
-    noise and 0.3 % of the arm's length; whose repeatability, deviations or share of outliers no robot has; whose errors
-    on held-out rows are larger than the nominal robot's, or that interpolates all rows; whose data were computed; and
-    one with a likely mistake. The limits were set on 48 tables with mistakes and 36 good ones; joint zeros are not
-    limited. Where the formulation limits the fit, other reasons than held-out rows follow from that, and are not named.
+    Not delivered is a robot whose fit did not converge; whose new rows an update does not explain; whose residuals
+    without outliers are beyond 3 times the stated noise and 0.3 % of the arm's length; whose repeatability, deviations
+    or share of outliers no robot has; whose errors on held-out rows are larger than the nominal robot's, or that
+    interpolates all rows; whose data were computed; and one with a likely mistake. The limits were set on 48 tables
+    with mistakes and 36 good ones; joint zeros are not limited. Where the formulation limits the fit, other reasons than held-out rows follow from that, and are not named.
     """
     mapping = result.mapping.caution if result.mapping else ""
     stretch, sigmas = _stretch(result)
@@ -188,7 +188,8 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     limited = tuple(text for text in causes if LIMITED in text)
     if limited:
         return Verdict((*limited, *_worse(result)), caution)
-    reasons = [] if result.converged else [result.message]
+    reasons = [sentence for earlier in result.record.earlier[-1:] for sentence in earlier.unresolved]
+    reasons += [] if result.converged else [result.message]
     reasons += [*_residuals(result), *_repeatability(result), *_deviations(result, bool(causes)), *scaled]
     out = {*np.array(result.problem.labels)[~kept_rows(result)].tolist(), *(row.label for row in result.left_out)}
     rows = len(out.union(result.problem.labels))

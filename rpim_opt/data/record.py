@@ -132,7 +132,7 @@ class Earlier(NamedTuple):
 
     Its title, when it was made, the digest of its file and its number of rows; the least and the largest value of every
     joint that it measured [rad or m], by robot; the factor on its standard deviations; parameters that were released,
-    and rows of the new data that were excluded.
+    and rows of the new data that were excluded; sentences on what these do not determine, or nothing explains.
     """
 
     title: str
@@ -143,6 +143,7 @@ class Earlier(NamedTuple):
     prior_inflation: float = 1.0
     released: tuple[str, ...] = ()
     excluded: tuple[str, ...] = ()
+    unresolved: tuple[str, ...] = ()
 
     @property
     def changed(self) -> str:

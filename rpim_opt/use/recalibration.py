@@ -129,11 +129,6 @@ class Update:
         """Whether readings and the previous calibration agree, apart from the changes."""
         return self.after.likely
 
-    @property
-    def delivered(self) -> bool:
-        """Whether all is explained and determined, and the calibration is delivered."""
-        return self.explained and not self.undetermined and self.result.verdict.delivered
-
     @cached_property
     def lacking(self) -> str:
         """A sentence on an effect that the model lacks by the new rows, and what to do; empty without one."""
@@ -195,24 +190,11 @@ class Update:
         lines += filter(None, [self._alternatives()])
         if self.changes:
             lines.append(f"After these changes: {self.after}.")
-        if self.undetermined:
-            omit = ", or omit --reset if nothing was moved" * bool(
-                {*self.undetermined} - {c.name for c in self.changes}
-            )
-            lines.append(
-                f"The new rows do not determine {joined(self.undetermined)}: measure more configurations, at least "
-                f"three with the reflector's positions not on a line{omit}."
-            )
         for name, of in self.errors.items():
             was, now = (f"{of[when]['rms_mm']:.4f} mm" for when in ("before", "after"))
             rows = counted(of["after"]["count"], f"{name} row")
             lines.append(f"RMS error on {rows}: {was} with the previous calibration, {now} with this one.")
         lines += filter(None, [self.lacking])
-        if not self.explained:
-            lines.append(
-                "No small set of changed parameters, frames or readings explains the rest. Check that it is the same "
-                "robot; if so, calibrate it without the previous result."
-            )
         rows = [[c.name, c.kind, three_digits(c.gain), f"{c.p_value:.2g}", f"{c.probability:.2g}"] for c in self.causes]
         head = ["may have changed", "kind", "chi-squared falls by", "p-value", "probability"]
         refused = [str(self.result.verdict)] * (not self.result.verdict.delivered)
@@ -258,11 +240,10 @@ def update(
     free = problem.parameters.free
     released = _reset(result, data, free, reset)
     say("comparing with the previous calibration")
-    elsewhere = ""
     base = tuple(name for name in free.names if name.startswith(registration(free, data)))
     unplaced = _unplaced(result, problem)
-    if not released and not unplaced:
-        elsewhere, released = _base_elsewhere(result, problem, base, prior_inflation)
+    elsewhere = not (released or unplaced) and _base_elsewhere(result, problem, base, prior_inflation)
+    released += base * elsewhere
     released += tuple(name for name in unplaced if name not in released)
     # a base that was reset may be anywhere: then it is registered again
     start = None if base and {*base} <= {*released} else previous_deviations(result, problem)
@@ -271,20 +252,36 @@ def update(
         _refuse_another_robot(result, updated, data, bool({*base} & {*released}))
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
     updated = _with_scales_of_motion(result, updated, released, prior_inflation)
-    left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
+    left_out = tuple(label for cause in changes if cause.kind == "reading" for label in cause.members)
+    moved = _moved(result, updated, released, changes)
+    unclear = {each.name for each in moved if abs(each.change) < 2 * each.std}
+    vague += tuple(cause.name for cause in changes if unclear.issuperset(cause.members))
     last = Earlier(
         result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],
         len(result.problem.labels), {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
         prior_inflation, tuple(name for name in released if name not in unplaced), left_out,
+        tuple(_unresolved(vague, changes, after)),
     )  # fmt: skip
     held_out = None if {*released} - {*unplaced} else result.record.validation  # which was measured before a change
     figures, said = _errors(result, updated, held_out)
-    elsewhere = " ".join(filter(None, [elsewhere, said]))
+    registered = " ".join(filter(None, [_bases(result, updated, data) if elsewhere else "", said]))
     updated = replace(updated, record=_carried_on(result.record, last, source))
-    moved = _moved(result, updated, released, changes)
-    unclear = {each.name for each in moved if abs(each.change) < 2 * each.std}
-    vague += tuple(cause.name for cause in changes if unclear.issuperset(cause.members))
-    return Update(updated, first[1], after, changes, first[0], moved, len(data), figures, elsewhere, vague)
+    return Update(updated, first[1], after, changes, first[0], moved, len(data), figures, registered, vague)
+
+
+def _unresolved(vague: Sequence[str], changes: Sequence[Cause], after: Fit) -> Iterator[str]:
+    """Say what new rows do not determine, and that nothing explains them."""
+    if vague:
+        omit = ", or omit --reset if nothing was moved" * bool({*vague} - {cause.name for cause in changes})
+        yield (
+            f"The new rows do not determine {joined(vague)}: measure more configurations, at least three with the "
+            f"reflector's positions not on a line{omit}."
+        )
+    if not after.likely:
+        yield (
+            "No small set of changed parameters, frames or readings explains the rest. Check that it is the same "
+            "robot; if so, calibrate it without the previous result."
+        )
 
 
 def _in_turn(
@@ -399,27 +396,29 @@ def _unplaced(result: Calibration, problem: CalibrationProblem) -> tuple[str, ..
     return tuple(name for name in wide if of_session(name) and name not in result.problem.parameters.free.names)
 
 
-def _base_elsewhere(
-    result: Calibration, problem: CalibrationProblem, base: tuple[str, ...], inflation: float
-) -> tuple[str, tuple[str, ...]]:
-    """Say where the base is and was, if readings that are displaced together put it out of its place; empty else.
-
-    And return the parameters of the ``base`` that are released then.
-    """
+def _base_elsewhere(result: Calibration, problem: CalibrationProblem, base: tuple[str, ...], inflation: float) -> bool:
+    """Return whether readings are displaced together and put the ``base``, by its parameters, out of its place."""
     # evidence is linear in the deviations: of a base that turned far, it is none
     data = problem.data
     if not base or not displacement(result, data, held_out_errors(result, data))[0]:
-        return "", ()
-    registered = _recalibrated(result, problem, base, inflation, None)
-    place = registration(problem.parameters.free, data)
-    session = str(data.session[0]) * (place != BASE)
-    was, now = (np.array(frame_numbers(base_frame(each, "", session))) for each in (result, registered))
-    if same_place(was, now):
-        return "", ()
+        return False
+    return not same_place(*_base_before_and_now(result, _recalibrated(result, problem, base, inflation, None), data))
+
+
+def _base_before_and_now(result: Calibration, updated: Calibration, data: Dataset) -> list[Array]:
+    """Return the place of the base, (6,) each, by two results."""
+    session = str(data.session[0]) * (registration(updated.problem.parameters.free, data) != BASE)
+    return [np.array(frame_numbers(base_frame(each, "", session))) for each in (result, updated)]
+
+
+def _bases(result: Calibration, updated: Calibration, data: Dataset) -> str:
+    """Say where the base is and was."""
+    was, now = map(placed, _base_before_and_now(result, updated, data))
+    place = registration(updated.problem.parameters.free, data)
     return (
-        f"The instrument or the base moved: in the instrument's frame the base is at {placed(now)}, previously at "
-        f"{placed(was)}. It was registered again, as with --reset '{place}*'."
-    ), base
+        f"The instrument or the base moved: in the instrument's frame the base is at {now}, previously at {was}. It "
+        f"was registered again, as with --reset '{place}*'."
+    )
 
 
 def _with_scales_of_motion(

@@ -129,7 +129,7 @@ def test_a_new_place_metres_away_is_no_change_of_the_robot(arm: ro.study.Simulat
     found = ro.use.update(result, ro.Dataset.of(arm.read.q[:30], y, NOISE, session=["away"] * 30))
     assert not found.changes
     assert found.before.likely
-    assert found.delivered
+    assert found.result.verdict.delivered
 
 
 def test_measurements_from_a_third_place_are_judged_by_the_robots_uncertainty_once_registered(

@@ -74,7 +74,7 @@ def test_an_instrument_better_than_the_robot_repeats_is_no_formulation_that_limi
     before, after = (ro.Dataset.of(each.q, each.blocks[0].y, SIGMA / 5) for each in (robot.before, robot.after))
     found = ro.use.update(ro.calibrate(robot.problem.on(before)), after)
     assert not found.changes
-    assert found.delivered, str(found)
+    assert found.result.verdict.delivered, str(found)
 
 
 def test_the_zero_of_joint_1_is_named_before_the_base() -> None:
@@ -166,6 +166,21 @@ def test_nothing_is_accused_where_nothing_changed() -> None:
     assert found.explained
     assert found.before == found.after
     assert str(found).startswith("No change of the robot is detectable from 8 readings")
+
+
+def test_what_an_update_does_not_explain_is_not_delivered_by_its_file_either(tmp_path) -> None:
+    """A forearm was bent in all directions: the sentence was printed, and the file exported and compensated."""
+    bent = {"alpha4": 3e-3, "a4": 8e-4, "theta4": 4e-3, "alpha5": -4e-3, "a5": -6e-4, "d5": 7e-4, "d4": 1e-3}
+    robot = happened(6, **bent)
+    found = ro.use.update(ro.calibrate(robot.problem.on(robot.before)), robot.after)
+    assert not found.explained
+    assert "explains the rest" in str(found)
+    ro.store.save_result(found.result, tmp_path)
+    verdict = ro.load_result(tmp_path).verdict
+    assert not verdict.delivered
+    assert "No small set of changed parameters, frames or readings explains the rest." in verdict.reasons[0]
+    excluded = ro.load_result(tmp_path).record.excluded
+    assert len(excluded) == len(robot.after) - found.errors["new"]["after"]["count"]
 
 
 def test_what_no_configuration_shows_stays() -> None:
@@ -271,7 +286,7 @@ def test_a_joint_that_slipped_is_found_after_half_a_turn_of_the_instrument() -> 
     robot = happened(7, base_x=-3.5, base_y=1.5, base_rz=np.pi, theta2=0.005)
     found = ro.use.update(ro.calibrate(robot.problem), robot.after.take(np.arange(6)), reset=("base_*",))
     assert [cause.name for cause in found.changes] == ["theta2"]
-    assert found.delivered
+    assert found.result.verdict.delivered
     (theta2,) = (each for each in found.moved if each.name == "theta2")
     assert abs(theta2.change - 0.005) < 4 * theta2.std
 
@@ -284,7 +299,7 @@ def test_a_change_that_is_smaller_than_its_standard_deviation_is_not_delivered(m
     assert found.explained
     assert [cause.name for cause in found.changes] == ["tool"]
     assert found.undetermined == ("tool",)
-    assert not found.delivered
+    assert not found.result.verdict.delivered
     ro.store.save_result(first, tmp_path)
     (tmp_path / "few.csv").write_text(table(robot.after.take(np.arange(3))))
     assert run(monkeypatch, "update", str(tmp_path), str(tmp_path / "few.csv"), "--reset", "base_*") == 1
