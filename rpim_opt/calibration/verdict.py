@@ -177,7 +177,8 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     without outliers are beyond 3 times the stated noise and 0.3 % of the arm's length; whose repeatability, deviations
     or share of outliers no robot has; whose errors on held-out rows are larger than the nominal robot's, or that
     interpolates all rows; whose data were computed; and one with a likely mistake. The limits were set on 48 tables
-    with mistakes and 36 good ones; joint zeros are not limited. Where the formulation limits the fit, other reasons than held-out rows follow from that, and are not named.
+    with mistakes and 36 good ones; joint zeros are not limited. Where the formulation limits the fit, other reasons
+    than held-out rows follow from that, and are not named.
     """
     mapping = result.mapping.caution if result.mapping else ""
     stretch, sigmas = _stretch(result)
