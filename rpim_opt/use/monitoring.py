@@ -33,6 +33,7 @@ ALLOWANCE = 0.5  # CUSUM's reference value k, taken off every deviate: sums answ
 CELLS = 150  # steps of a sum's range in the Markov chain of its distribution
 HIGHEST_LIMIT = 50.0
 SET_UP_ANEW = 3.0  # factor by which errors are smaller if every set-up is registered again, from which on they moved
+NEARLY = 0.9  # part of chi-squared that a change explains beyond its linearization, as of a base that is elsewhere
 MOTION = 1.0  # standard deviation of a motion that the checks alone tell [m, rad]
 
 
@@ -329,7 +330,7 @@ class _Explanations:
     the first of them.
     """
 
-    def __init__(self, result: Calibration, problem: CalibrationProblem, own: Array) -> None:
+    def __init__(self, result: Calibration, problem: CalibrationProblem, own: Array, bent: bool) -> None:
         framed, base, mine = _framed(problem)
         self.result, self.free, self.count = result, framed.parameters.free, len(problem.data)
         self.form = recalibration.penalty_of(recalibration.posterior_as_prior(result, problem), len(mine))
@@ -344,7 +345,7 @@ class _Explanations:
         self.moments = np.unique(moments.round().astype(int)).tolist()
         readings = list(recalibration.readings(problem, self.model))
         self.equations = {cause.members: rows for cause, rows in readings}
-        causes = [*recalibration.candidates(framed), *(cause for cause, _ in readings)]
+        causes = [*recalibration.candidates(framed, bent=bent), *(cause for cause, _ in readings)]
         self.priors = dict(zip(causes, recalibration.log_priors(causes).tolist(), strict=True))
 
     def columns(self, drift: Drift) -> Array:
@@ -352,19 +353,21 @@ class _Explanations:
         course = self.when / (self.count - 1) if drift.steady else self.when >= drift.first
         return self.A[:, self._places(drift.cause)] * course[:, None]
 
-    def found(self, kept: Array, beside: Array | None = None) -> list[Explained]:
-        """Return explanations of the equations that are kept (m, 1); with columns ``beside`` (m, c), readings alone."""
-        also = np.zeros((len(kept), 0)) if beside is None else beside * np.sqrt(self.result.variance_factor)
-        model = replace(self.model, A=np.hstack([self.model.A, also]) * kept, b=self.model.b * kept[:, 0])
+    def misfit(self, kept: Array, beside: Drift | None = None) -> recalibration.Misfit:
+        """Return the misfit of the equations that are kept (m, 1), beside a change."""
+        columns = self.columns(beside) * np.sqrt(self.result.variance_factor) if beside else np.zeros((len(kept), 0))
+        model = replace(self.model, A=np.hstack([self.model.A, columns]) * kept, b=self.model.b * kept[:, 0])
         wide = np.pad(self.form.matrix, ((0, 0), (0, model.A.shape[1] - self.form.matrix.shape[1])))
-        misfit = recalibration.Misfit(self.result, model, replace(self.form, L=wide))
-        found: list[Explained] = []
-        for cause in self.priors:
-            if cause.kind == "reading":
-                found.append(self._wrong(misfit, kept, cause))
-            elif beside is None:
-                found += self._changes(misfit, kept, cause)
-        return found
+        return recalibration.Misfit(self.result, model, replace(self.form, L=wide))
+
+    def readings(self, misfit: recalibration.Misfit, kept: Array) -> list[Explained]:
+        """Return every reading as wrong by itself."""
+        return [self._wrong(misfit, kept, cause) for cause in self.priors if cause.kind == "reading"]
+
+    def changes(self, misfit: recalibration.Misfit, kept: Array) -> list[Explained]:
+        """Return all changes."""
+        causes = [cause for cause in self.priors if cause.kind != "reading"]
+        return [each for cause in causes for each in self._changes(misfit, kept, cause)]
 
     def _places(self, cause: recalibration.Cause) -> list[int]:
         return [self.free.names.index(name) for name in cause.members]
@@ -398,8 +401,8 @@ class _Explanations:
         return self.priors[cause] + bayes, Drift(misfit.evidence(cause, g, G), int(self.when[rows[0]]), False, None)
 
 
-def _likeliest(found: Iterable[Explained]) -> Drift:
-    return max(found, key=lambda each: each[0])[1]  # as `update` has it: p-values favour few parameters
+def _likeliest(found: Iterable[Explained]) -> Explained:
+    return max(found, key=lambda each: each[0])  # as `update` has it: p-values favour few parameters
 
 
 def _drift(
@@ -409,26 +412,52 @@ def _drift(
 
     None, or none, where chance explains them, over all that were tried.
     """
-    explanations = _Explanations(result, problem, own)
+    found: list[_Explanation] = []
+    for single, bent in ((True, False), (False, False), (False, True)):  # many readings may be a change, many a link
+        found.append(_in_turn(_Explanations(result, problem, own, bent), level, single))
+        if found[-1].enough:
+            break
+    best = max(found, key=lambda each: (each.log, each.drift is not None))
+    return best.drift, best.wrong
+
+
+class _Explanation(NamedTuple):
+    """A change and wrong readings, the logarithm of their probability, and whether no other one is to be tried."""
+
+    log: float
+    drift: Drift | None
+    wrong: tuple[recalibration.Cause, ...]
+    enough: bool
+
+
+def _in_turn(explanations: _Explanations, level: float, single: bool) -> _Explanation:
+    """Return what explains checks, unless ``single`` a change at first, beside which readings may be wrong.
+
+    The probability is zero where more of them than `recalibration.SPARED` would be.
+    """
     kept = np.ones((len(explanations.A), 1))
     wrong: list[recalibration.Cause] = []
-    whole = found = explanations.found(kept)
-    while True:
-        best = out = _likeliest(found)
+    log, nearly = 0.0, None
+    while len(wrong) <= recalibration.SPARED * len(explanations.starts):
+        misfit = explanations.misfit(kept)
+        found = explanations.changes(misfit, kept) + single * explanations.readings(misfit, kept)
+        more, best = _likeliest(found)
         if best.cause.p_value * len(found) >= level:
-            return None, tuple(wrong)
-        if best.cause.kind != "reading":  # beside which readings may be wrong, too
-            out = _likeliest(explanations.found(kept, explanations.columns(best)))
-        if out.cause.p_value * len(found) >= level:
-            break
-        if len(wrong) >= recalibration.SPARED * explanations.count:  # of so many none is wrong by itself
-            wrong, found = [], [each for each in whole if each[1].cause.kind != "reading"]
-            best = _likeliest(found)
-            break
+            return _Explanation(log, None, tuple(wrong), len(wrong) <= 1)
+        out = best
+        if best.cause.kind != "reading":
+            beside = explanations.misfit(kept, best)
+            of_reading, out = _likeliest(explanations.readings(beside, kept))
+            if out.cause.p_value * len(found) >= level:
+                least = best.cause.gain - recalibration.AS_GOOD
+                others = [drift.cause for _, drift in found if drift.cause.gain > least]  # but those that contain it
+                apart = dict.fromkeys(cause.name for cause in others if not {*cause.members} >= {*best.cause.members})
+                enough = len(wrong) <= 1 and beside.fit.likely
+                return _Explanation(log + more, best._replace(others=tuple(apart)), tuple(wrong), enough)
+            if not wrong and best.cause.gain > NEARLY * misfit.fit.squares:
+                nearly = best
+            more = of_reading
+        log += more
         wrong.append(out.cause)
         kept[explanations.equations[out.cause.members]] = 0.0
-        found = explanations.found(kept)
-    least = best.cause.gain - recalibration.AS_GOOD
-    others = [drift.cause for _, drift in found if drift.cause.gain > least]  # but those that contain it
-    apart = dict.fromkeys(cause.name for cause in others if not {*cause.members} >= {*best.cause.members})
-    return best._replace(others=tuple(apart)), tuple(wrong)
+    return _Explanation(-np.inf, nearly, (), nearly is not None)

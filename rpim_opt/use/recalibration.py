@@ -50,6 +50,7 @@ OUTLIER_WIDTH = 10.0  # standard deviations by which an outlier is off, times `M
 UNOBSERVABLE = 1e-9  # part of the largest eigenvalue below which readings do not observe a direction of a change
 STAYING = 1e-2  # scales by which an update changes combinations of parameters that no configuration shows
 MOST = 4  # changes of robot and frames that are looked for one after the other: of more it is another robot
+FEW = 2  # of which more may be one of a link
 SPARED = 0.25  # part of the readings that may be wrong
 STRANGE = 5.0  # times the error before any calibration by which readings that no change explains are another robot's
 RIVAL, AS_GOOD = 0.05, 4.0  # probability, or what chi-squared falls less by, up to which another cause is named, too
@@ -247,7 +248,12 @@ def update(
     released += tuple(name for name in unplaced if name not in released)
     # a base that was reset may be anywhere: then it is registered again
     start = None if base and {*base} <= {*released} else previous_deviations(result, problem)
-    first, updated, released, changes, after = _in_turn(result, problem, released, prior_inflation, start, say)
+    found = _in_turn(result, problem, released, prior_inflation, start, say, False)
+    if len(found[3]) > FEW or not found[-1].likely:  # many changes of single parameters and readings may be one link
+        of_link = _in_turn(result, problem, released, prior_inflation, start, say, True)
+        if of_link[-1].likely and (len(of_link[3]) < len(found[3]) or not found[-1].likely):
+            found = of_link
+    first, updated, released, changes, after = found
     if not after.likely:
         _refuse_another_robot(result, updated, data, bool({*base} & {*released}))
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
@@ -291,6 +297,7 @@ def _in_turn(
     inflation: float,
     start: Array | None,
     say: Callable[[str], None],
+    bent: bool,
 ) -> tuple[Weighed, Calibration, tuple[str, ...], tuple[Cause, ...], Fit]:
     """Release the most probable change, one after the other, until chance explains the rest.
 
@@ -298,11 +305,11 @@ def _in_turn(
     in the order of their discovery, and the fit after them.
     """
     changes: list[Cause] = []
-    most = {"reading": max(SPARED * len(problem.data), 1)}
+    most = {"reading": max(SPARED * len(np.unique(problem.data.configuration)), 1), "link": 1}
     first: Weighed | None = None
     while True:
         updated = _recalibrated(result, problem, released, inflation, start)
-        causes, after = _weighed(result, updated.problem, updated.x, updated.formulation, released)
+        causes, after = _weighed(result, updated.problem, updated.x, updated.formulation, released, bent)
         first = first or (causes, after)
         # the most probable of the causes that chance does not explain
         cause = next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)
@@ -459,11 +466,14 @@ def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple
     left, motion = fit.squares - best.gain, registered_fit.squares - base.gain
     if between and left > NOTICED**2 * (fit.equations - len(best.members)):
         return between, ""
+    rivals = [
+        cause.name for cause in others if cause.gain > best.gain - AS_GOOD and not {*best.members} < {*cause.members}
+    ]
     if motion - left <= AS_GOOD:
-        return likely if left - motion > AS_GOOD else moved
-    names = [best.name, *(cause.name for cause in others if cause.gain > best.gain - AS_GOOD)]
+        alone = best.members[0].startswith(place) and not rivals
+        return likely if alone or left - motion > AS_GOOD else moved
     return (
-        f"Likely: {', or '.join(names)} changed: that leaves chi-squared {three_digits(left)} with "
+        f"Likely: {', or '.join([best.name, *rivals])} changed: that leaves chi-squared {three_digits(left)} with "
         f"{fit.equations - len(best.members)} degrees of freedom, a motion of the instrument or the base "
         f"{three_digits(motion)} with {fit.equations - len(base.members)}. Recalibrate by `update`; --register would "
         "hide the change."
@@ -696,10 +706,11 @@ class Misfit:
         return cause._replace(gain=gain, p_value=Fit.of(gain, int(observed.sum()), self.noise_dof).probability)
 
 
-def candidates(problem: Source, reset: Sequence[str] = ()) -> list[Cause]:
+def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -> list[Cause]:
     """Return the candidate changes: parameters of the robot, frames and transmission errors as a whole; none reset.
 
-    A motor that moves several joints shifts all their zeros.
+    A motor that moves several joints shifts all their zeros, and a plate moves all its reflectors. A link that is
+    ``bent`` changes all six numbers between its joints, which explain most of what moves a frame.
     """
     free, place = problem.parameters.free, registration(problem.parameters.free, problem.sample().data)
     causes = []
@@ -719,6 +730,14 @@ def candidates(problem: Source, reset: Sequence[str] = ()) -> list[Cause]:
             moved = [problem.parameters.called(which, zeros[k]) for k in np.flatnonzero(column)]
             if len(moved) > 1 and {*moved} <= {*free.names} - {*reset}:
                 wholes[f"motor {arm.joint(motor)} ({joined(moved)})", "joint offset"] = moved
+        for i in range(1, len(arm.mdh) * bent):
+            own = [f"theta{i}", f"d{i}", f"beta{i}", *(f"{kind}{i + 1}" for kind in ("alpha", "a", "theta", "d"))]
+            members = [name for name in (problem.parameters.called(which, each) for each in own) if name in free.names]
+            if len(members) > 1 and not {*members} & {*reset}:
+                wholes[f"between joints {i} and {i + 1}", "link"] = members
+    tools = [names for (name, kind), names in wholes.items() if kind == "frame" and name.startswith("tool")]
+    if len(tools) > 1:
+        wholes["all reflectors", "frame"] = [name for names in tools for name in names]
     return causes + [Cause(*whole, tuple(names)) for whole, names in wholes.items()]
 
 
@@ -732,14 +751,16 @@ def readings(problem: Source, model: LinearModel) -> Iterator[tuple[Cause, np.nd
         yield Cause(labels[0], "reading", tuple(labels)), np.flatnonzero(model.group == number)
 
 
-def _weighed(result: Calibration, problem: Source, x: Array, prior: Formulation, released: Sequence[str]) -> Weighed:
+def _weighed(
+    result: Calibration, problem: Source, x: Array, prior: Formulation, released: Sequence[str], bent: bool = False
+) -> Weighed:
     """Return all causes with their evidence at x (n,) [SI], the most probable first, and how well all fits."""
     free = problem.parameters.free
     model = problem.linearize(x)
     misfit = Misfit(result, model, penalty_of(prior, len(x)), [free.names.index(name) for name in released])
     width = prior_widths(result, problem) / free.scale
     tried: list[tuple[Cause, tuple[Array, Array], Array]] = []  # with its change, and the widths of that
-    for cause in candidates(problem, released):
+    for cause in candidates(problem, released, bent):
         index = [free.names.index(name) for name in cause.members]
         tried.append((cause, misfit.projected(slice(misfit.m, None), misfit.L[:, index]), width[index]))
     for cause, equations in readings(problem, model):

@@ -203,6 +203,23 @@ def test_a_zero_that_changed_before_the_checks_is_no_backlash_of_another_joint(n
     assert found.mistake.startswith(f"Likely: {name} changed: that leaves chi-squared")
 
 
+def test_a_plate_moves_all_its_reflectors() -> None:
+    """Configurations were wrong one by one, beside a base that had moved."""
+    problem = ro.load("markers").problem
+    half = problem.data.configuration < np.median(problem.data.configuration)
+    result = ro.calibrate(problem.on(problem.data.take(np.flatnonzero(half))))
+    checks = problem.on(problem.data.take(np.flatnonzero(~half)))
+    names = problem.parameters.free.names
+    moved = np.array([5e-4 * (name.startswith("tool") and name.endswith("_x")) for name in names])
+    moved += [-3e-4 * (name.startswith("tool") and name.endswith("_y")) for name in names]
+    moves = zip(checks.data.blocks, checks.modelled(moved), checks.modelled(np.zeros(len(names))), strict=True)
+    blocks = tuple(replace(block, y=block.y + there - here) for block, there, here in moves)
+    found = ro.use.monitor(result, replace(checks.data, blocks=blocks))
+    assert found.drift is not None
+    assert found.drift.cause.name == "all reflectors"
+    assert not found.wrong
+
+
 def test_update_and_monitor_say_one_size_of_a_change() -> None:
     """What the first calibration did not know of a joint offset is no part of its change."""
     result, data = checked(4, np.full(CHECKS, 5e-4))

@@ -272,7 +272,7 @@ def test_new_registers_sessions_that_stand_apart_by_themselves(
     # a tracker that was moved since then, under the name of a session, is no change of the robot (it was one of a1)
     y = arm.read.blocks[0].y[:12] + np.array([5e-3, 0.0, 0.0])
     later = ro.Dataset.of(arm.read.q[:12], y, NOISE, session=["near"] * 12)
-    assert "`update --reset 'session_near_*'`" in ro.use.validate(result, later).mistake
+    assert "recalibrate by `update`" in ro.use.validate(result, later).mistake
     updated = ro.use.update(result, later)
     assert {cause.name for cause in updated.changes} <= {"session_near"}
     assert updated.explained

@@ -168,10 +168,25 @@ def test_nothing_is_accused_where_nothing_changed() -> None:
     assert str(found).startswith("No change of the robot is detectable from 8 readings")
 
 
-def test_what_an_update_does_not_explain_is_not_delivered_by_its_file_either(tmp_path) -> None:
-    """A forearm was bent in all directions: the sentence was printed, and the file exported and compensated."""
-    bent = {"alpha4": 3e-3, "a4": 8e-4, "theta4": 4e-3, "alpha5": -4e-3, "a5": -6e-4, "d5": 7e-4, "d4": 1e-3}
+def test_a_link_that_was_bent_is_one_change() -> None:
+    """By a crash, in six numbers: good readings were left out in its place."""
+    bent = {"theta3": 2e-3, "d3": 4e-4, "alpha4": -1.5e-3, "a4": 5e-4, "theta4": -1e-3, "d4": -6e-4}
     robot = happened(6, **bent)
+    first = ro.calibrate(robot.problem.on(robot.before))
+    found = ro.use.update(first, robot.after)
+    assert [cause.name for cause in found.changes] == ["between joints 3 and 4"]
+    assert {*bent} <= {*found.changes[0].members}
+    assert rms(found.result, robot.now) < 4 * SIGMA * 1e3
+    assert found.result.verdict.delivered
+    drift = ro.use.monitor(first, robot.after).drift
+    assert drift is not None
+    assert (drift.cause.name, drift.first) == ("between joints 3 and 4", 0)
+
+
+def test_what_an_update_does_not_explain_is_not_delivered_by_its_file_either(tmp_path) -> None:
+    """Two links were bent: the sentence was printed, and the file exported and compensated."""
+    bent = {"alpha3": 3e-3, "a3": 8e-4, "theta2": 4e-3, "alpha5": -4e-3, "a5": -6e-4, "d5": 7e-4, "theta4": 3e-3}
+    robot = happened(6, **bent, d1=1e-3, theta1=2e-3)
     found = ro.use.update(ro.calibrate(robot.problem.on(robot.before)), robot.after)
     assert not found.explained
     assert "explains the rest" in str(found)

@@ -73,6 +73,8 @@ ANGLES = {
 LENGTHS_OF_ALL = "all measured lengths"
 MOST_TIMES, FACTORS, FINER = 3e3, 49, 3
 """Largest factor of a column that is sought, how many are tried, and how many of them are refined."""
+ROWS_OF_THOUSANDS, WIDER = 3, 2.0
+"""Rows that lost their thousands at least, and points' extent over the nominal flange's beyond which none did."""
 SLIPPED = ((1, "low", "up"), (-1, "high", "down"))
 """By how many rows a column may have slipped, where it is then, and which way back."""
 DEGREES_PER_MM = np.radians(1) / 1e-3  # radians that a metre stands for where millimetres were degrees
@@ -294,8 +296,10 @@ def _of_positions(points: Points) -> Iterator[Misreading]:
         return replace(points, y=np.where(small, 1e3 * points.y, points.y))
 
     for k, axis in enumerate("xyz"):
-        what = f"values of column {axis} above 1000 mm read as a thousandth (1.234,5 as 1.2345)"
-        yield Misreading(what, "export them without separators of thousands", partial(with_thousands, k))
+        other = with_thousands(k, points)
+        if np.count_nonzero(other.y != points.y) >= ROWS_OF_THOUSANDS and other.extent < WIDER * width:
+            what = f"values of column {axis} above 1000 mm read as a thousandth (1.234,5 as 1.2345)"
+            yield Misreading(what, "export them without separators of thousands", partial(with_thousands, k))
     yield Misreading("azimuths and elevations exchanged", "exchange the names of these columns", from_other_angle)
     for side in (1.0, -1.0):
         remedy = "name the column zenith_deg in place of elevation_deg, or vice versa"
