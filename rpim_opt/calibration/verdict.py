@@ -116,7 +116,8 @@ LARGEST_CURVE = 0.01  # standard deviation of transmission errors [rad] beyond a
 LARGEST = {"length": 0.02, "angle": 0.05}  # a machined and assembled robot deviates by less than this [m, rad]
 ARM = ("compliance", "moment", "ecc", "transmission")  # beginnings of extension parameters that are the arm's own
 NOTHING = (
-    "None of the tested input mistakes explains the residuals. Check the nominal parameters; is the arm compliant?"
+    "None of the tested input mistakes explains the residuals. Check the nominal parameters; did the arm move while it "
+    "was measured, or is it compliant?"
 )
 
 

@@ -56,7 +56,7 @@ FREE = 1.0  # [m, rad] standard deviation of where touched points and planes are
 NORMAL, HEAVY, LIKELIER = 1e3, 3.0, 7.0
 """Degrees of freedom of Student's distributions of all rows; log odds at which some are of another kind (1,000:1)."""
 JUMPING = 0.5  # mean square step of every joint over that of rows in random order, above which rows have no order
-BENDS = 4  # degree of the polynomial that the side of a rail is
+BENDS = 12  # degree of the polynomial that the side of a rail is
 COURSES = 6  # half waves that a slow motion has over all rows at most
 PLACES, PRECISE, SPANS = 40, 120, 12
 """Rows and joint values from which on something may have moved, and those between which it did and moved back."""
