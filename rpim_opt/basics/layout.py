@@ -13,7 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, in_file, pick
-from rpim_opt.basics.tables import Columns, Grid, array_columns, is_numeral, list_of_numbers, read_columns, read_grid
+from rpim_opt.basics.tables import (
+    WITH_UNIT,
+    Columns,
+    Grid,
+    array_columns,
+    is_numeral,
+    list_of_numbers,
+    read_columns,
+    read_grid,
+)
 from rpim_opt.basics.units import DIMENSIONS, UNIT_SIGNS, UNITS, numeral, parse_units, split
 
 FULL = 0.6  # a row belongs to the data if it has this part of the numbers of the fullest row
@@ -46,7 +55,6 @@ PARTS = re.compile(r"(j|a|q|joint_?|axis_?)1(?: \1\d)+")
 """What tables with one row per quantity name in that row: the axes and whatever else, or joints alone, sorted."""
 VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.IGNORECASE)
 """What the column is called that holds the coordinates of a table with one row per coordinate."""
-WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 """A number with its unit in the cell."""
 UNITS_WORD = re.compile(r"\b(?:units?|einheit(?:en)?|unités?|unidades|unità)\b", re.IGNORECASE)
 """Words before the units in a line above the header."""

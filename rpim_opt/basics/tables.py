@@ -28,7 +28,7 @@ import scipy
 
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import LARGEST_DATA, read_bytes, read_text, require_file
-from rpim_opt.basics.units import numeral
+from rpim_opt.basics.units import UNIT_SIGNS, numeral
 
 WIDEST = 1000
 """Columns that a table may have: with all covariances of a pose and many joints it has a hundred."""
@@ -69,6 +69,7 @@ ENCODINGS = "--encoding with the one that fits: cp932 (Japanese), gb18030 (Chine
 ZEROS = bytes(8)  # no text has so many zeros in a row, in whatever encoding
 ROW_OF_NUMBERS = 1 / 3
 """Fraction of a row's cells that are numbers, from which on the row shows the separator."""
+WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 BLANKS_CLEARLY = 1.5
 """Blanks separate cells where they part so many times more numbers than any sign does: a label may hold some."""
 FORMULA = re.compile(r"'*[=+\-@\t\r\uff1d\uff0b\uff0d\uff20]")
@@ -324,8 +325,13 @@ def _separator(text: str) -> str:
 
 def _parted(row: Sequence[str]) -> int:
     """Return how many numbers a row has, including those of cells that list several."""
-    numbers = [len(list_of_numbers(cell)) or is_numeral(cell) for cell in row if cell]
+    numbers = [len(list_of_numbers(cell)) or is_numeral(cell) or _has_unit(cell) for cell in row if cell]
     return sum(numbers) if sum(numbers) >= ROW_OF_NUMBERS * len(numbers) else 0
+
+
+def _has_unit(cell: str) -> bool:
+    match = WITH_UNIT.fullmatch(cell)
+    return match is not None and match[2].lower() in UNIT_SIGNS
 
 
 def list_of_numbers(cell: str) -> list[str]:

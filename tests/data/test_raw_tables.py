@@ -489,6 +489,34 @@ def test_three_readings_side_by_side_are_rows_of_one_configuration(tmp_path: Pat
         read(write(tmp_path, head + rows.replace("401.1", "421.1")))
 
 
+def test_units_in_cells_separated_by_tabs(tmp_path: Path) -> None:
+    """Blanks before the units parted more numbers than tabs."""
+    rows = "".join(f"{i}\t{i + 0.5}°\t-{i}.25°\t{400 + i}.125 mm\t{i}.5 mm\t7.125 mm\n" for i in range(1, 5))
+    found = read(write(tmp_path, "Nr.\tAxis 1\tAxis 2\tX\tY\tZ\n" + rows, "raw.txt"))
+    assert found.columns["q1_deg"] == ["1.5", "2.5", "3.5", "4.5"]
+    assert found.columns["z_mm"] == ["7.125"] * 4
+
+
+def test_an_external_axis_is_the_joint_that_slides(tmp_path: Path) -> None:
+    """A1 was read as the rail, and no option helped."""
+    types = ("prismatic", "revolute", "revolute")
+    arm = ro.robot.Robot("on a rail", np.vstack([np.zeros((1, 5)), ARM.mdh]), joint_types=types)
+    head = "Point,A1 [deg],A2 [deg],E1 [mm],X [mm],Y [mm],Z [mm]\n"
+    found = read(write(tmp_path, head + "P1,1,2,2366.5,401,5,6\nP2,3,4,1200,402,6,7\n"), robot=arm)
+    assert [found.columns[name] for name in ("q1_mm", "q2_deg", "q3_deg")] == [
+        ["2366.5", "1200"],
+        ["1", "3"],
+        ["2", "4"],
+    ]
+    program = "DECL E6AXIS XP1={A1 1.5,A2 -2,E1 2366.4,E2 0.0}\nDECL E6AXIS XP2={A1 3.5,A2 -4,E1 120,E2 0.0}\n"
+    joints = read(write(tmp_path, program, "raw.dat"), robot=arm)
+    assert [joints.columns[name] for name in ("label", "q1_mm", "q3_deg")] == [
+        ["P1", "P2"],
+        ["2366.4", "120"],
+        ["-2", "-4"],
+    ]
+
+
 def test_equal_rows_of_a_spreadsheet_are_as_many_as_they_were(tmp_path: Path) -> None:
     """OpenDocument states equal rows once, with their number; empty ones to the end of the sheet too."""
 

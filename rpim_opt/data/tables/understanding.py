@@ -26,6 +26,7 @@ from rpim_opt.robot.mdh import Robot
 TURNED = ("rx", "ry", "rz")
 """Columns of three turns; without a unit they may also be a rotation vector, as Universal Robots' are."""
 COORDINATES = {"x", "y", "z"}
+EXTERNAL = re.compile(r"e_?1|ext(?:ernal)?_?(?:axis_?)?1?", re.IGNORECASE)
 ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
 READING = re.compile(r"((?:p|pos|position|meas|measured|shot)?[\s_]*([xyz]))[\s_]*([1-9])", re.IGNORECASE)
 NEAR_READINGS = 0.01  # part of the points' spread up to which those of a row are one point, and no other reflectors
@@ -225,6 +226,7 @@ def _readings(
     numbered(read, table, dof, options.quaternion)
     _put_in_robots_order(read, table, dof, joints)
     _count_from_one(read, dof)
+    _beside_external_axis(read, robot)
     for stems in ({f"q{i}" for i in range(1, dof + 1)}, COORDINATES):
         read.update(_without_prefix(read, stems, joints, options.prefix))
     _counted(read, robot)
@@ -335,6 +337,17 @@ def _rename(read: Meanings, new: Mapping[str, str], why: str) -> None:
     for name, each in read.items():
         if each.stem in new:
             read[name] = each._replace(stem=new[each.stem], why=why.format(each.why))
+
+
+def _beside_external_axis(read: Meanings, robot: Robot) -> None:
+    """Take KUKA's ``E1`` for the only joint that slides, and A1, A2, ... for the others."""
+    axes = [name for name, each in read.items() if EXTERNAL.fullmatch(each.stem)]
+    slides = [i for i, kind in enumerate(robot.joint_dimensions, start=1) if kind == "length"]
+    missing = {f"q{i}" for i in range(1, robot.dof + 1)} - {each.stem for each in read.values()}
+    if len(axes) == len(slides) == 1 and missing == {f"q{robot.dof}"}:
+        others = [i for i in range(1, robot.dof + 1) if i not in slides]
+        _rename(read, {f"q{k}": f"q{i}" for k, i in enumerate(others, start=1)}, "{}, beside an external axis")
+        read[axes[0]] = read[axes[0]]._replace(stem=f"q{slides[0]}", why="the external axis, which slides")
 
 
 def _count_from_one(read: Meanings, dof: int) -> None:

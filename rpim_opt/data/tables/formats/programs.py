@@ -4,7 +4,7 @@ FANUC ``P[1:"name"]{ UF : 0, UT : 1, J1= 10.000 deg, ... };``; KUKA ``DECL E6AXI
 ``CONST jointtarget P1:=[[10,-90,...],[9E9,...]];``; Universal Robots ``movej([0.1, -1.57, ...])`` and ``P1_q = [...]``
 in rad, ``p[...]`` in m and rad; Yaskawa ``C00000=10.0,-90.0,...`` below ``///POSTYPE ANGLE``; Kawasaki
 ``#p1 10.0 -90.0 ...`` below ``.JOINTS``; Mitsubishi ``J1=(+10.00,-90.00,...)``; Staubli
-``<Value key="0" j1="10" j2="-90" ... />``. External axes are left out.
+``<Value key="0" j1="10" j2="-90" ... />``. External axes are left out but KUKA's first, E1.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ MITSUBISHI = re.compile(r"^[ \t]*(J\w*)[ \t]*=[ \t]*\(([-+\d.][-+\d., \t]*)\)", 
 STAUBLI = re.compile(r"<(Data|Value)\s([^<>]{0,2000})>")
 PLACE = [f"commanded {axis} [mm]" for axis in "xyz"]
 TURN = [f"commanded q{part}" for part in "wxyz"]
-PAIR = re.compile(rf'\b([AJ]\d|[XYZABCWPR])\s*[= ]\s*"?({NUMBER})(?:\s*(deg|mm))?', re.IGNORECASE)
+PAIR = re.compile(rf'\b([AJ]\d|E1|[XYZABCWPR])\s*[= ]\s*"?({NUMBER})(?:\s*(deg|mm))?', re.IGNORECASE)
 """A joint, a coordinate or a turn that is stated by name."""
+LENGTHS = ("X", "Y", "Z", "E1")  # of these without a unit: the first external axis, if it is a joint, is a rail
 Target = tuple[str, Mapping[str, str]]
 
 
@@ -55,7 +56,7 @@ def _paired(name: str, fields: str) -> Target:
     values = {}
     for part, value, unit in PAIR.findall(fields):
         header = part.upper() if part[1:] else f"commanded {part.upper()}"
-        values[f"{header} [{unit or ('mm' if part in 'xyzXYZ' else 'deg')}]"] = value
+        values[f"{header} [{unit or ('mm' if part.upper() in LENGTHS else 'deg')}]"] = value
     return name, values
 
 
