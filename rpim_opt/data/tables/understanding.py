@@ -35,7 +35,6 @@ INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
 CONTROLLER = re.compile(r"\$?pos_act|actual_tcp", re.IGNORECASE)
 """Beginning of coordinates that a controller computes: KUKA's and Universal Robots'."""
 PLACED = 3  # configurations, at least, for each place of an instrument: three points tell it
-REPEATED = 0.2  # share of rows whose label is there again, up to which they are of a reference point
 INCOMPLETE = 0.25  # share of the rows that may lack one of several values, and are left out then
 MEANINGS = {
     "label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
@@ -570,22 +569,22 @@ def _rows_with_values(table: CanonicalTable, robot: Robot, kind: Measurement) ->
     if not whole.labels:
         raise InputError("the table", "no row with values", "at least one")
     columns = dict(whole.columns)
-    own = [str(cell).strip() for cell in columns.get("label", ())]
+    own = [str(cell).strip() for cell in columns.get("label") or columns.get("configuration", ())]
     both = [f"{label}/{marker}" for label, marker in zip(own, columns.get("marker", ()), strict=False)]
-    if both and not _unique(own) and _unique(both):
+    if both and not _unique(own):
         notes.append("labels combine point and reflector.")
-        columns = {"configuration": own, **columns, "label": both}
-    elif not _unique(own):
+        if _unique(both):
+            columns = {"configuration": own, **columns}
+        columns["label"] = own = both
+    if own and not all(own):
+        notes.append("some labels are empty: rows are numbered.")
+        columns.pop("label", None)
+    elif not _unique(own):  # a reference point, or checks of the same poses
         times = Counter(own)
-        again = next((label for label, count in times.items() if count > 1), "")
-        single = [times[label] == 1 for label in own]
-        if all(own) and single.count(False) <= REPEATED * len(own):  # a reference point, of other rows in other files
-            notes.append(f"labels are not unique: the row number is appended to '{again}'.")
-            named = zip(own, single, strict=True)
-            columns["label"] = [label if one else f"{label} (row {i})" for i, (label, one) in enumerate(named, start=1)]
-        else:
-            notes.append(f"labels are not unique ('{again}'): rows are numbered.")
-            del columns["label"]
+        again = next(label for label, count in times.items() if count > 1)
+        notes.append(f"labels are not unique: the row number is appended to '{again}'.")
+        named = enumerate(own, start=1)
+        columns["label"] = [label if times[label] == 1 else f"{label} (row {i})" for i, label in named]
     return replace(whole, columns=columns, notes=tuple(notes))
 
 
