@@ -525,7 +525,7 @@ def monitor(
 ) -> Output:
     """Detect drift in check readings over time, by their prediction intervals and a CUSUM chart.
 
-    Exit code 1 if the robot drifts.
+    Exit code 1 if the robot drifts, or a reading is wrong.
     """
     with _loaded(result) as (loaded, _):
         read = ro.use.read_measurements(loaded, checks, measurement, tables.options)

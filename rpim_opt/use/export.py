@@ -356,7 +356,10 @@ def _write_urdf(
     if of_tool and tip_measured:
         tool, at_tip = arm.tool, None
         moved = 1e3 * np.linalg.norm(tool[:3] - own.tool[:3])
-        notes.append(f"URDF: {tip} moved by {moved:.3g} mm to the reflector, {placed(tool)} in the flange frame.")
+        notes.append(
+            f"URDF: {tip} moved by {moved:.3g} mm to the reflector, {placed(tool)} in the flange frame; other links on "
+            "the flange keep their places of the file, which no measurement shows."
+        )
     elif of_tool:
         at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
         there = f"in its frame the reflector is at {at}; --tip-measured (tip_measured=True) moves it there"
@@ -403,7 +406,7 @@ def _write_ur_kinematics(result: Calibration, robot: str, marker: str | None, so
     notes.append(
         "The ROS driver reads these origins; the controller keeps its own kinematics, and the hash is unchanged."
     )
-    return [*notes, _of_controller(arm), *write_ur_kinematics(source, arm.robot, target)]
+    return [*notes, _of_controller(result, marker, arm), *write_ur_kinematics(source, arm.robot, target)]
 
 
 def _write_ur_calibration(result: Calibration, robot: str, marker: str | None, source: Path, target: Path) -> list[str]:
@@ -432,11 +435,13 @@ def _write_ur_calibration(result: Calibration, robot: str, marker: str | None, s
         notes.append(
             "calibration.conf cannot hold the tilt and offset of axis 1 (alpha1, a1): its Base is defined on axis 1."
         )
-    return [*notes, _of_controller(replace(arm, base=frame_numbers(numeric_frame(arm.base) @ axis)))]
+    return [*notes, _of_controller(result, marker, replace(arm, base=frame_numbers(numeric_frame(arm.base) @ axis)))]
 
 
-def _of_controller(arm: RobotSetup) -> str:
+def _of_controller(result: Calibration, marker: str | None, arm: RobotSetup) -> str:
     """Return the TCP and the Base that belong to a robot in files of Universal Robots, as PolyScope states poses."""
+    known = reflectors(result.problem.parameters.names)
+    which = "the reflector" if len(known) == 1 else f"reflector {marker or known[0]} (--marker states another)"
     half = np.pi * bool((arm.robot.mdh[2:4, 1] > 0).all())  # from ROS's base_link to Base
     texts = []
     for T in (numeric_frame(arm.tool), numeric_frame(arm.base) @ numeric_link(theta=half)):
@@ -445,7 +450,7 @@ def _of_controller(arm: RobotSetup) -> str:
         angles = (f"{name} {value:z.5f}" for name, value in zip(("RX", "RY", "RZ"), vector, strict=True))
         texts.append(f"{' '.join(lengths)} mm, {' '.join(angles)} rad")
     return (
-        f"TCP to enter in PolyScope for the reflector (rotation vector, from the tool flange): {texts[0]}. "
+        f"TCP to enter in PolyScope for {which} (rotation vector, from the tool flange): {texts[0]}. "
         f"The controller's Base in the instrument's frame (rotation vector): {texts[1]}."
     )
 

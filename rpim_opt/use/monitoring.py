@@ -121,12 +121,13 @@ class Monitoring:
         if self.drift or self.alarm is not None or any(self.label[i] not in out for i in self.beyond):
             lines = [f"The robot deviates from its calibration ({count}).", *filter(None, [self.mistake])]
         elif self.wrong:
-            lines = [f"No drift in {len(self.label) - len(out)} of {count}."]
-        lines += [
-            f"Reading {listed(cause.members)} is wrong by itself: chi-squared falls by {three_digits(cause.gain)}, "
-            f"p-value {cause.p_value:.2g}. Measure it again."
-            for cause in self.wrong
-        ]
+            lines = [f"No drift in {len(self.label) - len(out)} of {count}; the others are wrong readings."]
+        for cause in self.wrong:
+            what = f"Reading {cause.members[0]} is wrong by itself"
+            if len(cause.members) > 1:
+                what = f"A reading of one configuration, {listed(cause.members)}, is wrong by itself"
+            figures = f"chi-squared falls by {three_digits(cause.gain)}, p-value {cause.p_value:.2g}"
+            lines.append(f"{what}: {figures}. Measure it again.")
         if self.beyond:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
             lines.append(f"Outside the prediction interval of a new reading: {listed(named, between='; ')}.")

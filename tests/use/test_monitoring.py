@@ -90,7 +90,7 @@ def test_one_wrong_check_of_a_place_is_named_and_no_other(moves: bool) -> None:
         found = ro.use.monitor(result, data)
         assert [cause.members for cause in found.wrong] == [(data.label[14],)]
         assert (found.drift, found.alarm, found.beyond) == (None, None, (14,))
-        assert str(found).startswith("No drift in 23 of 24 checks.")
+        assert str(found).startswith("No drift in 23 of 24 checks; the others are wrong readings.")
 
 
 @pytest.mark.parametrize("first", [50, 51, 52])
