@@ -233,7 +233,8 @@ def scatter(result: Outcome) -> str:
     return (
         f"Readings scatter by {three_digits(1e3 * size)} mm RMS, {noise} and more than industrial robots of this size "
         f"({three_digits(1e3 * most)} mm): did the arm vibrate, or something shake the instrument? Is the reflector, "
-        "tool or base loose? Repeat five configurations, and state the instrument's noise ([noise])."
+        "tool or base loose? Are joint values commanded, not read? Repeat five configurations, and state the "
+        "instrument's noise ([noise])."
     )
 
 
