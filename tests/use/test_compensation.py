@@ -413,7 +413,7 @@ def test_the_predicted_uncertainty_covers_what_is_missed() -> None:
     for seed in range(60):
         problem, truth = simulated(noise=5e-5, seed=seed, configurations=30)
         result = ro.calibrate(problem, ro.tikhonov, 1.0)
-        found = ro.use.compensate(result, q)
+        found = ro.use.compensate(result, q, orientation=True)
         good = ok(found)
         place, turn = misses(reading(result, truth, found.q), wanted(result, q))
         ratios.append(np.mean((place / found.std)[good] ** 2))
