@@ -141,7 +141,7 @@ class Monitoring:
                 course = "steadily from the first to the last check"
             lines.append(
                 f"Best explained by {cause.kind} {self.drift.moved or cause.name}, {course}: chi-squared falls by "
-                f"{three_digits(cause.gain)}, p-value {cause.p_value:.2g}."
+                f"{three_digits(cause.gain)}, p-value {cause.p_value:.2g}. Recalibrate by `update`."
             )
             if self.drift.others:
                 lines.append(f"A change of {joined(self.drift.others)} explains the checks as well: measure more.")
@@ -217,12 +217,12 @@ def monitor(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
         allowed=np.sqrt(equations * fdtri(equations, max(result.noise_dof, 1.0), 1 - level / count)),
         sums=cusum(deviate * right), limit=cusum_limit(count, level), drift=drift, wrong=wrong, registered=motion,
-        mistake=_mistake(result, data, right, explained=register and drift is not None),
+        mistake=_mistake(result, data, right, register, drift),
     )  # fmt: skip
 
 
-def _mistake(result: Calibration, data: Dataset, right: np.ndarray, explained: bool) -> str:
-    """Return a likely mistake in checks (N,), or unless ``explained`` a change by those that are right; or nothing."""
+def _mistake(result: Calibration, data: Dataset, right: np.ndarray, register: bool, drift: Drift | None) -> str:
+    """Return a likely mistake in checks (N,), or a motion by those that are right if drift may be one; or nothing."""
     names = set_ups(result, data)
     if len(names) > 1:
         with suppress(InputError):
@@ -231,7 +231,8 @@ def _mistake(result: Calibration, data: Dataset, right: np.ndarray, explained: b
                 return f"Likely: the instrument or the base moved between sessions {listed(names)}. Use --register."
     found = misread(result, data)
     data = data.take(np.flatnonzero(right))
-    if found or explained or not len(data):
+    moved = drift is None or (not register and (drift.cause.kind == "frame" or drift.others))
+    if found or not moved or not len(data):
         return found
     return recalibration.moved_or_changed(result, data, held_out_errors(result, data))[0]
 

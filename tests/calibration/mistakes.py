@@ -325,7 +325,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     "thousands read as decimals": (values(without_thousands), "values of column x above 1000 mm read as a thousandth"),
     "the reflector before the last joint": (
         moved_otherwise(lambda q: q * (np.arange(q.shape[-1]) < q.shape[-1] - 1)),
-        "standing still in all rows, or the reflector on the link of joint",
+        "the reflector on the link of joint",
     ),
     "the reflector on link 4": (
         moved_otherwise(lambda q: q * (np.arange(q.shape[-1]) < 4)),

@@ -180,9 +180,12 @@ def test_an_instrument_that_was_set_up_anew_is_no_change_of_the_arm_where_the_ba
 def test_a_joint_that_slipped_is_no_moved_base() -> None:
     """Though checks of one region are displaced as a whole, nearly: a joint leaves clearly less of chi-squared."""
     result, data = checked(1, np.full(CHECKS, 1e-3), around=0.2)
-    for found in (ro.use.monitor(result, data), ro.use.validate(result, data)):
-        assert re.match(r"Likely: theta3 changed: that leaves chi-squared \d+", found.mistake)
-        assert "--register in" not in str(found)
+    found = ro.use.monitor(result, data)
+    assert found.drift is not None
+    assert (found.drift.cause.name, found.mistake) == ("theta3", "")
+    validated = ro.use.validate(result, data)
+    assert re.match(r"Likely: theta3 changed: that leaves chi-squared \d+", validated.mistake)
+    assert "--register in" not in str(found) + str(validated)
     accepted = ro.calibration.accept(result, ro.data.Requirement(limit=2e-4), data)  # which does not compare them
     assert "Likely" not in str(accepted)
     assert "If neither moved, the robot changed, and --register would hide that." in str(accepted)
@@ -200,7 +203,7 @@ def test_a_zero_that_changed_before_the_checks_is_no_backlash_of_another_joint(n
     found = ro.use.monitor(result, replace(checks.data, blocks=(replace(block, y=block.y + by_change),)))
     assert found.drift is not None
     assert found.drift.cause.name == name
-    assert found.mistake.startswith(f"Likely: {name} changed: that leaves chi-squared")
+    assert not found.mistake
 
 
 def test_a_plate_moves_all_its_reflectors() -> None:

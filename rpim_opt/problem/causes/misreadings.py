@@ -73,8 +73,8 @@ ANGLES = {
 LENGTHS_OF_ALL = "all measured lengths"
 MOST_TIMES, FACTORS, FINER = 3e3, 49, 3
 """Largest factor of a column that is sought, how many are tried, and how many of them are refined."""
-ROWS_OF_THOUSANDS, WIDER = 3, 2.0
-"""Rows that lost their thousands at least, and points' extent over the nominal flange's beyond which none did."""
+ROWS_OF_THOUSANDS, THOUSANDTH, WIDER = 3, 0.3, 2.0
+"""Rows that lost their thousands at least, what others reach [m], and the most that points extend over the flange's."""
 SLIPPED = ((1, "low", "up"), (-1, "high", "down"))
 """By how many rows a column may have slipped, where it is then, and which way back."""
 DEGREES_PER_MM = np.radians(1) / 1e-3  # radians that a metre stands for where millimetres were degrees
@@ -297,7 +297,9 @@ def _of_positions(points: Points) -> Iterator[Misreading]:
 
     for k, axis in enumerate("xyz"):
         other = with_thousands(k, points)
-        if np.count_nonzero(other.y != points.y) >= ROWS_OF_THOUSANDS and other.extent < WIDER * width:
+        lost = (other.y != points.y).any(axis=1)
+        below = np.abs(points.y[~lost, k]).max(initial=0.0)  # which reach up to a thousand
+        if np.count_nonzero(lost) >= ROWS_OF_THOUSANDS and below > THOUSANDTH and other.extent < WIDER * width:
             what = f"values of column {axis} above 1000 mm read as a thousandth (1.234,5 as 1.2345)"
             yield Misreading(what, "export them without separators of thousands", partial(with_thousands, k))
     yield Misreading("azimuths and elevations exchanged", "exchange the names of these columns", from_other_angle)
