@@ -136,11 +136,12 @@ class Monitoring:
             lines.append(f"Cumulative sum above its limit at check {at}, rising since {since}.")
         if self.drift is not None:
             cause, first = self.drift.cause, self.drift.first
+            what = f"{cause.kind} {self.drift.moved}" if self.drift.moved else str(cause)
             course = {0: "before the first check"}.get(first, f"in one step before {self._named(first)}")
             if self.drift.steady:
                 course = "steadily from the first to the last check"
             lines.append(
-                f"Best explained by {cause.kind} {self.drift.moved or cause.name}, {course}: chi-squared falls by "
+                f"Best explained by {what}, {course}: chi-squared falls by "
                 f"{three_digits(cause.gain)}, p-value {cause.p_value:.2g}. Recalibrate by `update`."
             )
             if self.drift.others:

@@ -72,6 +72,10 @@ class Cause(NamedTuple):
     p_value: float = 1.0  # of that where nothing changed
     probability: float = 0.0  # posterior
 
+    def __str__(self) -> str:
+        """Return its kind and name, a link by its name."""
+        return f"{self.kind} {self.name}".removeprefix("link ")
+
 
 Weighed = tuple[tuple[Cause, ...], Fit]
 """All causes with their evidence, the most probable first, and how well all fits."""
@@ -184,7 +188,7 @@ class Update:
         lines = [*filter(None, [self.registered]), f"{verdict}: {self.before}."]
         for cause in self.changes:
             figures = f"chi-squared falls by {three_digits(cause.gain)}, posterior probability {cause.probability:.2g}"
-            lines.append(f"  {cause.kind} {cause.name}: {figures}{', excluded' * (cause.kind == 'reading')}.")
+            lines.append(f"  {cause}: {figures}{', excluded' * (cause.kind == 'reading')}.")
         moved = [str(each) for each in self.moved if not (self.registered and each.name.startswith(BASE))]
         if moved:
             lines.append(f"Changed since then: {joined(moved)}.")
@@ -734,7 +738,7 @@ def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -
             own = [f"theta{i}", f"d{i}", f"beta{i}", *(f"{kind}{i + 1}" for kind in ("alpha", "a", "theta", "d"))]
             members = [name for name in (problem.parameters.called(which, each) for each in own) if name in free.names]
             if len(members) > 1 and not {*members} & {*reset}:
-                wholes[f"between joints {i} and {i + 1}", "link"] = members
+                wholes[f"link between joints {i} and {i + 1}", "link"] = members
     tools = [names for (name, kind), names in wholes.items() if kind == "frame" and name.startswith("tool")]
     if len(tools) > 1:
         wholes["all reflectors", "frame"] = [name for names in tools for name in names]

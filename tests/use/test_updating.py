@@ -174,13 +174,13 @@ def test_a_link_that_was_bent_is_one_change() -> None:
     robot = happened(6, **bent)
     first = ro.calibrate(robot.problem.on(robot.before))
     found = ro.use.update(first, robot.after)
-    assert [cause.name for cause in found.changes] == ["between joints 3 and 4"]
+    assert [cause.name for cause in found.changes] == ["link between joints 3 and 4"]
     assert {*bent} <= {*found.changes[0].members}
     assert rms(found.result, robot.now) < 4 * SIGMA * 1e3
     assert found.result.verdict.delivered
     drift = ro.use.monitor(first, robot.after).drift
     assert drift is not None
-    assert (drift.cause.name, drift.first) == ("between joints 3 and 4", 0)
+    assert (drift.cause.name, drift.first) == ("link between joints 3 and 4", 0)
 
 
 def test_what_an_update_does_not_explain_is_not_delivered_by_its_file_either(tmp_path) -> None:
