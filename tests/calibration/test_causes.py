@@ -1087,6 +1087,17 @@ def test_gravity_of_few_rows_is_no_slipped_joint() -> None:
     assert result.verdict.delivered
 
 
+def test_few_rows_do_not_tell_which_of_them_scatter() -> None:
+    """Three of eleven real poses were called so, of arms that scatter by more than the stated noise."""
+    gross = np.zeros((40, 3))
+    gross[:4] = 1e-3 * np.random.default_rng(3).normal(size=(4, 3))
+    many = values(lambda y: y + gross)(simulated_arm("ur5", 3, 40))
+    few = many.on(many.data.take(np.arange(11)))
+    said = [list(scattered_rows(each, ridge_deviations(each))) for each in (many, few)]
+    assert said[0]
+    assert not said[1]
+
+
 def test_columns_that_few_rows_fit_exactly_do_not_tell_the_noise_of_another() -> None:
     """Three gross errors in ten rows: with x hardly weighed nothing is left of y and z."""
     gross = np.zeros((10, 3))

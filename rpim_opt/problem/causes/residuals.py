@@ -499,6 +499,8 @@ def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     is integrated out (Laplace).
     """
     (A, b, owners), N = _row_by_row(problem, x), len(problem.data)
+    if N < 2 * OUTLYING:  # few rows hardly show their noise
+        return
     count = np.bincount(owners, minlength=N).astype(float)
 
     def fitted(spread: Callable[[Array], tuple[Array, Array]], w: Array) -> tuple[float, Array, Array]:
