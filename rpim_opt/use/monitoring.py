@@ -417,7 +417,7 @@ def _drift(
     """
     found: list[_Explanation] = []
     for single, bent in ((True, False), (False, False), (False, True)):  # many readings may be a change, many a link
-        found.append(_in_turn(_Explanations(result, problem, own, bent), level, single))
+        found.append(_explained(_Explanations(result, problem, own, bent), level, single))
         if found[-1].enough:
             break
     best = max(found, key=lambda each: (each.log, each.drift is not None))
@@ -433,7 +433,7 @@ class _Explanation(NamedTuple):
     enough: bool
 
 
-def _in_turn(explanations: _Explanations, level: float, single: bool) -> _Explanation:
+def _explained(explanations: _Explanations, level: float, single: bool) -> _Explanation:
     """Return what explains checks, unless ``single`` a change at first, beside which readings may be wrong.
 
     The probability is zero where more of them than `recalibration.SPARED` would be.
