@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from scipy.special import logsumexp
 
-from rpim_opt.basics.arrays import Array, rms, statistics
+from rpim_opt.basics.arrays import TINY, Array, rms, statistics
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import counted, joined, table, three_digits
 from rpim_opt.basics.units import display, printed
@@ -48,7 +48,9 @@ MULTIPLES = (1.0, 3.0, 10.0, 30.0)  # multiples of a deviation's prior width tha
 UNCHANGED = 0.5  # prior probability that nothing changed; the other half is dealt out to the kinds of causes in use
 OUTLIER_WIDTH = 10.0  # standard deviations by which an outlier is off, times `MULTIPLES`
 UNOBSERVABLE = 1e-9  # part of the largest eigenvalue below which readings do not observe a direction of a change
-STAYING = 1e-2  # scales by which an update changes combinations of parameters that no configuration shows
+STAYING = 1e-2
+"""Scales by which an update changes combinations of parameters that no configuration shows, and the part of one that
+must be left beside released parameters for it to stay."""
 MOST = 4  # changes of robot and frames that are looked for one after the other: of more it is another robot
 FEW = 2  # of which more may be one of a link
 SPARED = 0.25  # part of the readings that may be wrong
@@ -616,11 +618,13 @@ def _staying(problem: Source, x: Array, released: Sequence[str]) -> Array:
     slopes = []
     for _ in range(-(-2 * len(free) // len(data))):
         blocks = tuple(replace(block, q=block.q + rng.uniform(-1, 1, block.q.shape)) for block in data.blocks)
-        slopes.append(problem.on(replace(data, blocks=blocks)).linearize(x).A)
+        A = problem.on(replace(data, blocks=blocks)).linearize(x).A
+        size = np.linalg.norm(A, axis=1, keepdims=True)  # of pixels of a point beside the camera beyond all others
+        slopes.append((A / np.maximum(size, TINY))[np.isfinite(size[:, 0])])
     s, V = np.linalg.svd(np.vstack(slopes), full_matrices=False)[1:]
     rows = V[s <= UNOBSERVABLE * s[0]] * ~np.isin(free.names, list(released))
     s, V = np.linalg.svd(rows, full_matrices=False)[1:]
-    return V[s > RANK_TOLERANCE] / (STAYING * free.scale)
+    return V[s > STAYING] / (STAYING * free.scale)
 
 
 def _opened(C: Array, rows: Array) -> Array:
