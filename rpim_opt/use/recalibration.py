@@ -618,7 +618,8 @@ def _staying(problem: Source, x: Array, released: Sequence[str]) -> Array:
     slopes = []
     for _ in range(-(-2 * len(free) // len(data))):
         blocks = tuple(replace(block, q=block.q + rng.uniform(-1, 1, block.q.shape)) for block in data.blocks)
-        A = problem.on(replace(data, blocks=blocks)).linearize(x).A
+        other = problem.on(replace(data, blocks=blocks))
+        A = other.contrasts(other.jacobian(x)) * free.scale
         size = np.linalg.norm(A, axis=1, keepdims=True)  # of pixels of a point beside the camera beyond all others
         slopes.append((A / np.maximum(size, TINY))[np.isfinite(size[:, 0])])
     s, V = np.linalg.svd(np.vstack(slopes), full_matrices=False)[1:]

@@ -216,6 +216,16 @@ def test_what_no_configuration_shows_stays() -> None:
     assert found.covariance[i, i] == pytest.approx(first.covariance[i, i], rel=0.1)
 
 
+def test_views_of_a_camera_update_a_robot() -> None:
+    """At random configurations, which show what stays, points are beside the camera."""
+    problem = ro.load("camera").problem
+    early = problem.data.configuration < np.quantile(np.unique(problem.data.configuration), 0.7)
+    first, later = (problem.data.take(np.flatnonzero(rows)) for rows in (early, ~early))
+    found = ro.use.update(ro.calibrate(problem.on(first)), later)
+    assert not found.changes
+    assert found.result.verdict.delivered
+
+
 def test_a_wrong_reading_is_no_change_of_the_robot() -> None:
     robot = happened(6)
     block = robot.after.blocks[0]
