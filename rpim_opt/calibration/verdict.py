@@ -649,9 +649,9 @@ def _beside_a_good_fit(
     alone, x = _without_outliers(result, ordered, again=noticed)
     error = rms(problem.errors(result.x)[kept])
     causes = first(
+        _in_place_of_extensions(result, alone),
         shown_by_residuals(alone, x) if noticed else (),
         roundings(problem, error, (1 - MOVED) ** -0.5) if noticed else (),
-        _in_place_of_extensions(result, alone),
     )
     if causes:
         return causes, together
@@ -848,7 +848,7 @@ def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Ite
             f"noise. They bias {loss}: use formulation 'robust', or leave them out ([exclude])."
         )
         return
-    yield from first(shown_by_residuals(alone, x), _in_place_of_extensions(result, alone))
+    yield from first(_in_place_of_extensions(result, alone), shown_by_residuals(alone, x))
 
 
 def _in_place_of_extensions(result: Outcome, alone: CalibrationProblem) -> Iterator[str]:

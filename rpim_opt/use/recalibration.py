@@ -596,7 +596,7 @@ def posterior_as_prior(
         without = tuple(name for name in released if name in known)
         # in units of the declared noise, as the new readings are: weight 1 then joins both
         prior = Prior.from_result(result, inflation, without, noise=1.0) & prior
-    rows = _staying(problem, x, released)
+    rows = _staying(result, problem, x, released)
     if len(rows):
         values = tuple((rows @ x).tolist())
         prior = prior & Prior(statements=(Statement(free.names, free.dimensions, nested(rows), values),))
@@ -604,12 +604,12 @@ def posterior_as_prior(
     return prior.stated(problem.parameters, widened=False).penalized(plain)
 
 
-def _staying(problem: Source, x: Array, released: Sequence[str]) -> Array:
+def _staying(result: Calibration, problem: Source, x: Array, released: Sequence[str]) -> Array:
     """Return combinations (k, n) [1 / SI] of deviations at x (n,) [SI] that no configuration shows, and that stay.
 
     A turn of the base and one of joint 1 are such: the posterior is as wide as the prior there, with constant slopes,
     and in the curvature of what follows (a turn by g moves points by g^2) new readings would fit their noise. Of
-    released parameters all others are held, so that these take the change.
+    released parameters, and new ones of a session, all others are held, so that these take the change.
     """
     if not isinstance(problem, CalibrationProblem):
         return np.zeros((0, len(x)))
@@ -623,7 +623,8 @@ def _staying(problem: Source, x: Array, released: Sequence[str]) -> Array:
         size = np.linalg.norm(A, axis=1, keepdims=True)  # of pixels of a point beside the camera beyond all others
         slopes.append((A / np.maximum(size, TINY))[np.isfinite(size[:, 0])])
     s, V = np.linalg.svd(np.vstack(slopes), full_matrices=False)[1:]
-    rows = V[s <= UNOBSERVABLE * s[0]] * ~np.isin(free.names, list(released))
+    kept = np.isin(free.names, result.problem.parameters.free.names) & ~np.isin(free.names, list(released))
+    rows = V[s <= UNOBSERVABLE * s[0]] * kept
     s, V = np.linalg.svd(rows, full_matrices=False)[1:]
     return V[s > STAYING] / (STAYING * free.scale)
 
@@ -664,7 +665,7 @@ def _recalibrated(
             drift=np.zeros((len(updated.x), 0)),  # the prior holds what was not known of the scales
         )
         held = replace(updated, learned=learned).covariance
-        learned = replace(learned, drift=_opened(held, _staying(problem, updated.x, released)))
+        learned = replace(learned, drift=_opened(held, _staying(result, problem, updated.x, released)))
     return replace(updated, learned=learned, calibrate_again=partial(calibrate, formulation=formulation, weight=1.0))
 
 

@@ -1048,7 +1048,7 @@ def test_a_known_value_that_is_wrong_is_named_first(monkeypatch, capsys, tmp_pat
     capsys.readouterr()
     assert run(monkeypatch, "calibrate", str(cell), "--model", model) == 1
     said = capsys.readouterr().out
-    assert f"The data contradict prior '{value} +- 0.05 mm', by {off} mm" in said
+    assert re.search(rf"The data contradict prior '{re.escape(value)} \+- 0.05 mm' \(nominal: .*\), by {off} mm", said)
     assert "Likely" not in said
     file.write_text(f'{plain}\n[prior]\nknown = ["{value.partition(" ")[0]} = nominal - 0.3 +- 0.4 mm"]\n')
     assert run(monkeypatch, "calibrate", str(cell), "--model", model) == 0
