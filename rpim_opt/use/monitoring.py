@@ -415,11 +415,12 @@ def _drift(
 
     None, or none, where chance explains them, over all that were tried.
     """
-    found: list[_Explanation] = []
-    for single, bent in ((True, False), (False, False), (False, True)):  # many readings may be a change, many a link
-        found.append(_explained(_Explanations(result, problem, own, bent), level, single))
-        if found[-1].enough:
-            break
+    explanations = _Explanations(result, problem, own, False)
+    found = [_explained(explanations, level, True)]
+    if not found[-1].enough:  # many readings may be a change
+        found.append(_explained(explanations, level, False))
+    if not found[-1].enough:  # and many a link
+        found.append(_explained(_Explanations(result, problem, own, True), level, False))
     best = max(found, key=lambda each: (each.log, each.drift is not None))
     return best.drift, best.wrong
 

@@ -664,8 +664,8 @@ def _recalibrated(
             local=np.append(learned.local, np.ones(len(more))),
             drift=np.zeros((len(updated.x), 0)),  # the prior holds what was not known of the scales
         )
-        held = replace(updated, learned=learned).covariance
-        learned = replace(learned, drift=_opened(held, _staying(result, problem, updated.x, released)))
+        rows = _staying(result, problem, previous_deviations(result, problem), released)
+        learned = replace(learned, drift=_opened(replace(updated, learned=learned).covariance, rows))
     return replace(updated, learned=learned, calibrate_again=partial(calibrate, formulation=formulation, weight=1.0))
 
 
@@ -734,21 +734,28 @@ def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -
             wholes.setdefault((name.rpartition("_")[0], kind), []).append(name)
         else:
             causes.append(Cause(name, kind, (name,)))
+    tools = [names for (name, kind), names in wholes.items() if kind == "frame" and name.startswith("tool")]
+    if len(tools) > 1:
+        wholes["all reflectors", "frame"] = [name for names in tools for name in names]
+    known = {*free.names} - {*reset}
+    causes += [cause for cause in _of_arms(problem, bent) if {*cause.members} <= known]
+    return causes + [Cause(*whole, tuple(names)) for whole, names in wholes.items()]
+
+
+def _of_arms(problem: Source, bent: bool) -> Iterator[Cause]:
+    """Yield motors that move several joints, and links that are bent, by the identified numbers between two joints."""
+    names = problem.parameters.free.names
     for which, arm in problem.arms.items():
         zeros = [("d" if kind == "prismatic" else "theta") + str(i) for i, kind in enumerate(arm.joint_types, 1)]
         for motor, column in enumerate(arm.joint_map.T):
             moved = [problem.parameters.called(which, zeros[k]) for k in np.flatnonzero(column)]
-            if len(moved) > 1 and {*moved} <= {*free.names} - {*reset}:
-                wholes[f"motor {arm.joint(motor)} ({joined(moved)})", "joint offset"] = moved
+            if len(moved) > 1:
+                yield Cause(f"motor {arm.joint(motor)} ({joined(moved)})", "joint offset", tuple(moved))
         for i in range(1, len(arm.mdh) * bent):
             own = [f"theta{i}", f"d{i}", f"beta{i}", *(f"{kind}{i + 1}" for kind in ("alpha", "a", "theta", "d"))]
-            members = [name for name in (problem.parameters.called(which, each) for each in own) if name in free.names]
-            if len(members) > 1 and not {*members} & {*reset}:
-                wholes[f"link between joints {i} and {i + 1}", "link"] = members
-    tools = [names for (name, kind), names in wholes.items() if kind == "frame" and name.startswith("tool")]
-    if len(tools) > 1:
-        wholes["all reflectors", "frame"] = [name for names in tools for name in names]
-    return causes + [Cause(*whole, tuple(names)) for whole, names in wholes.items()]
+            members = [name for name in (problem.parameters.called(which, each) for each in own) if name in names]
+            if len(members) > 1:
+                yield Cause(f"link between joints {i} and {i + 1}", "link", tuple(members))
 
 
 def readings(problem: Source, model: LinearModel) -> Iterator[tuple[Cause, np.ndarray]]:

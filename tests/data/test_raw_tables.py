@@ -489,6 +489,13 @@ def test_three_readings_side_by_side_are_rows_of_one_configuration(tmp_path: Pat
         read(write(tmp_path, head + rows.replace("401.1", "421.1")))
 
 
+def test_rows_are_named_by_pose_and_reflector_unless_a_name_is_empty(tmp_path: Path) -> None:
+    head = "Pose,Reflector,J1 [deg],J2 [deg],X [mm],Y [mm],Z [mm]\n"
+    rows = "V1,A,1,2,401,5,6\nV1,B,1,2,402,6,7\nV1,A,1,2,401,5,7\n"
+    assert read(write(tmp_path, head + rows)).labels == ["V1/A (row 1)", "V1/B", "V1/A (row 3)"]
+    assert read(write(tmp_path, head + rows.replace("V1,B", ",B"))).labels == ["1", "2", "3"]
+
+
 def test_units_in_cells_separated_by_tabs(tmp_path: Path) -> None:
     """Blanks before the units parted more numbers than tabs."""
     rows = "".join(f"{i}\t{i + 0.5}°\t-{i}.25°\t{400 + i}.125 mm\t{i}.5 mm\t7.125 mm\n" for i in range(1, 5))

@@ -15,6 +15,7 @@ from rpim_opt.basics import InputError
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.calibration.uncertainty import position_budget
+from rpim_opt.robot.chain import placed
 from rpim_opt.store import problems_folder
 from rpim_opt.store.result_file import digest
 from tests.simulate import simulated
@@ -214,6 +215,14 @@ def test_what_no_configuration_shows_stays() -> None:
     assert abs(now["theta1"] - was["theta1"]) < 1e-5
     i = free.names.index("theta1")
     assert found.covariance[i, i] == pytest.approx(first.covariance[i, i], rel=0.1)
+
+
+def test_the_base_is_said_where_it_is_after_the_last_change() -> None:
+    """It was said where it was before a joint was released, decimetres away."""
+    robot = happened(7, base_x=-3.5, base_y=1.5, base_rz=3.0, theta2=0.02)
+    found = ro.use.update(ro.calibrate(robot.problem), robot.after)
+    assert [cause.name for cause in found.changes] == ["theta2"]
+    assert f"the base is at {placed(ro.use.identified(found.result).base)}, previously" in found.registered
 
 
 def test_views_of_a_camera_update_a_robot() -> None:

@@ -571,7 +571,7 @@ def _rows_with_values(table: CanonicalTable, robot: Robot, kind: Measurement) ->
     columns = dict(whole.columns)
     own = [str(cell).strip() for cell in columns.get("label") or columns.get("configuration", ())]
     both = [f"{label}/{marker}" for label, marker in zip(own, columns.get("marker", ()), strict=False)]
-    if both and not _unique(own):
+    if both and all(own) and not _unique(own):
         notes.append("labels combine point and reflector.")
         if _unique(both):
             columns = {"configuration": own, **columns}
