@@ -135,9 +135,9 @@ Several = "several files are stacked, or joined as by rpim-opt new."
 NEAREST = "Join files by nearest time, with this largest difference [s]."
 ROTATION = "Meaning of rx, ry, rz: 'extrinsic xyz' (default), 'intrinsic zyx', vector."
 Tolerance = Annotated[Number, Option(help="Acceptance limit [mm]: exit code 1 if rejected, 4 if inconclusive.")]
-Register = Annotated[bool, Option("--register", help="The instrument was moved: register it again before judging.")]
+Register = Annotated[bool, Option("--register", help="The instrument was moved: register it again first.")]
 Box = Annotated[Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's base; default: measured joint ranges.")]
-Measured = Annotated[Choice, Option("--measured/--region", help="Judge measured configurations, or all of the region.")]
+Measured = Annotated[Choice, Option("--measured/--region", help="Test measured configurations, or the whole region.")]
 Marker = Annotated[Text, Option(help="Name of the reflector, if there are several.")]
 UrdfBase = Annotated[Text, Option(help="Base link of the chain; default: the root of the URDF.")]
 UrdfTip = Annotated[Text, Option(help="Tip link of the chain, if there are several.")]
@@ -150,7 +150,7 @@ CONF = "calibration.conf copied from a Universal Robot's controller; corrected f
 Convention = Annotated[str, Option(help="Convention of --mdh: modified (Craig), or standard (Paul, Hayati; .csv).")]
 TIP = "The reflector is the tip link: write its identified pose."
 PERMITTED = "Largest permitted error [mm]: exit code 1 if exceeded; default: the result's limit."
-REMAINING = "Largest residual error plus its U (k = 2) [mm]: exit code 1 above; default: the result's limit."
+REMAINING = "Largest residual error plus its U (k = 2) [mm]: exit code 1 if exceeded; default: the result's limit."
 ORIENTATION = "Correct the orientation of all targets, or of none; default: of all if its U is below the nominal error."
 Workers = Annotated[int, Option(help="Number of parallel processes.")]
 Resume = Annotated[Choice, Option(help="Resume an interrupted run, or discard it and start again.")]
@@ -327,7 +327,7 @@ def calibrate(
     drop_outliers: Annotated[
         bool, Option("--drop-outliers", help="Calibrate again without the rows that are flagged as outliers.")
     ] = False,
-    use_validation: Annotated[Choice, Option(help="Refit with validation rows; default: after new --hold-out.")] = None,
+    use_validation: Annotated[Choice, Option(help="Refit to all rows; default: if new --hold-out was used.")] = None,
     limit: Tolerance = None,
     box: Box = None,
     measured: Measured = None,

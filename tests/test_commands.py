@@ -570,7 +570,7 @@ def test_joint_values_that_are_ignored_are_a_likely_cause(monkeypatch, capsys, c
     arguments = ("--data", str(cell / "measured.csv"), "--units", "rad,m", "--urdf-tip", "link_5")
     assert run(monkeypatch, "new", "short", "--robot", str(cell / "arm.urdf"), *arguments) == 0
     assert run(monkeypatch, "calibrate", "short", "--out", "short") == 1
-    assert "Likely: joint values joint_6 are ignored, since the robot has 5:" in capsys.readouterr().out
+    assert "Likely: joint values joint_6 are ignored (the robot has 5 joints):" in capsys.readouterr().out
 
 
 def test_the_links_that_new_was_given_are_those_of_export(monkeypatch, capsys, cell, tmp_path) -> None:

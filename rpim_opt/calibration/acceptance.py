@@ -362,7 +362,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         lacking.append("Missing: constraints that agree with the data; U depends on them.")
     if ambiguous_deviation(result):
         check = "Missing: a check of the frame or scale named below; U does not include its error. If it is right, "
-        lacking.append(f"{check}write the parameters that deviate into the robot's file as identified.")
+        lacking.append(f"{check}enter the identified values of the deviating parameters in the robot file.")
     undecided = () if result.mapping is None else result.mapping.ambiguities
     lacking += [reason for reason in result.verdict.reasons if reason in undecided]
     against = [reason for reason in result.verdict.reasons if reason not in undecided]
@@ -397,7 +397,7 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
     """Return a sentence on what is missing for a bound within the limit [m]."""
     bound = found.largest
     if not np.isfinite(bound):
-        return "Missing: measurements that identify the parameter combinations that neither data nor penalty determine."
+        return "Missing: measurements that identify parameter combinations that neither data nor penalty determines."
     if repeatability > limit:
         return (
             f"Missing: a tighter bound on repeatability, which may contribute {1e3 * repeatability:.3f} mm. Approach "
@@ -437,7 +437,7 @@ def _rows_apart(result: Calibration, data: Dataset | None) -> tuple[Dataset, Hel
             apart = apart.without(used) if used else apart
             held = held_out_errors(result, apart)
             mistake, remark = displacement(result, apart, held)
-            return apart, held, [], f"{mistake} `validate` compares the two." if mistake else remark
+            return apart, held, [], f"{mistake} `validate` names the likelier cause." if mistake else remark
         if held is not None and not set(held.label).issuperset(used.values()):
             return None
     if held is None:
@@ -463,7 +463,7 @@ def _held_out(
     """Return the test of a limit by held-out rows: a document [mm] or None, rows beyond it, and what is missing."""
     found = _rows_apart(result, data)
     if found is None:
-        used = "; an update identifies from all rows that it reads" * bool(result.record.earlier)
+        used = "; an update uses all its rows for identification" * bool(result.record.earlier)
         used = used if data is None else f"; all {len(data)} rows of the table are identification rows"
         return None, [], [f"Missing: held-out rows (`new --hold-out`, or a table for `accept --data`){used}."]
     apart, held, excluded, moved = found

@@ -77,7 +77,7 @@ class FitCovariance:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance (n, n) [SI]; infinite for combinations that neither data nor penalty determine."""
+        """Covariance (n, n) [SI]; infinite for combinations that neither data nor penalty determines."""
         C = self.noise + self.prior
         open_ended = np.sum(self.form.undetermined(self.weight) ** 2, axis=1) > 1e-12
         C[open_ended, open_ended] = np.inf

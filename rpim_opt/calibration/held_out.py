@@ -34,7 +34,7 @@ def rows_used(result: Calibration, data: Dataset) -> dict[str, str]:
 
 
 def coverage_text(held: HeldOut) -> str:
-    """Return how held-out rows agree with their prediction as text; empty without one."""
+    """Return the coverage of the held-out rows' prediction intervals as text; empty if they have none."""
     if held.coverage is None:
         return ""
     share = f"{100 * held.coverage:.0f} % of the coordinates are within their 95 % prediction intervals"

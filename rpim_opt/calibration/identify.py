@@ -45,8 +45,7 @@ MODELS = {"geometry": ("position", "orientation", "instrument"), "auto": NOISE["
 LEVEL = 1e-9  # relative fall of the objective over five iterations below which it hardly changes
 DIVERGES = "poorly identifiable combinations diverge without a penalty; add one."
 DIVERGES_PENALIZED = (
-    "combinations that neither the data nor the penalty determine diverge; use a larger weight, or penalize all "
-    "parameters."
+    "combinations that neither data nor penalty determines diverge; use a larger weight, or penalize all parameters."
 )
 DISPLACED = "Deviations refer to registered frames"
 ZERO = 0.1  # standard deviation [rad] of a joint's zero that was found from the data
@@ -220,7 +219,7 @@ def ending(ended: Ended, most: int) -> str:
     diverges = DIVERGES_PENALIZED if state.choice.weight else DIVERGES
     exceeded = f"eviations exceed {FAR:g} prior standard deviations: {diverges}"
     if not ended.settled:
-        what = "the positions predicted in the constraints still change: loosen them, or use a larger weight"
+        what = "positions predicted in the constraints still change: loosen these constraints, or use a larger weight"
         return f"Not converged: after {ROUNDS} linearizations {what}."
     if ended.converged:
         text = f"Converged after {iterations}."
@@ -234,6 +233,7 @@ def ending(ended: Ended, most: int) -> str:
             why = "the final convex program could not be solved again, so the solution is not certified."
         elif decrease > DECREASE:
             why = f"the final convex program still predicts a decrease of the objective by {100 * decrease:.1g} %."
+        why += " Check [scale]; verbose=True shows the solver's messages."
     elif state.outcome == "stalled":
         why = (
             "no step, however short, decreases the nonlinear objective; the formulation may have no minimum "

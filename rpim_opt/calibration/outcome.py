@@ -115,7 +115,7 @@ class Outcome:
 
     @cached_property
     def contradiction(self) -> str:
-        """A sentence on constraints that the data contradict; empty where they do not, or the loss has no squares.
+        """A sentence on constraints that the data contradict; empty if there are none, or no quadratic model.
 
         Without constraints the sum of squares falls by chi-square of as many degrees of freedom as are active, if they
         hold for the robot, times the residuals' variance where that is larger than the noise. Of a robust loss they
@@ -372,7 +372,7 @@ class Outcome:
 
     @cached_property
     def moves(self) -> Array | None:
-        """An orthonormal basis (n, k) of the steps of z that active constraints leave; None where none is active."""
+        """Orthonormal basis (n, k) of the steps of z that active constraints permit; None if none is active."""
         return self.program.tangent(self.z, self.penalty_weight) if self.formulation.solvable else None
 
     @cached_property
@@ -382,7 +382,7 @@ class Outcome:
         InputError for a penalty that is not quadratic, or a loss without a quadratic model.
         """
         if not self.program.linear_penalty:
-            raise self.no_covariance("`forward` and monte_carlo work with any")
+            raise self.no_covariance("`forward` and monte_carlo work with any formulation")
         form = ridge(self.squares, self.program.penalty_form)
         if self.moves is not None:  # conditional on the active constraints
             form = ridge_within(self.squares, self.program.penalty_form, self.moves, self.z)
@@ -581,7 +581,7 @@ class Outcome:
 
     @cached_property
     def active_constraints(self) -> tuple[str, ...]:
-        """Names of the formulation's constraints that hold the solution, on which intervals rest."""
+        """Names of the formulation's active constraints, on which intervals are conditional."""
         constraints = self.formulation.constraints
         if not constraints or not self.formulation.solvable:
             return ()

@@ -276,7 +276,7 @@ def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None =
 
 
 def unregistered(result: Outcome, data: Dataset, held: HeldOut) -> str:
-    """Return a sentence on the sessions whose registration is unknown, so that rows have no interval; empty without."""
+    """Return a sentence on sessions of unknown registration, whose rows have no interval; empty if there are none."""
     if result.no_intervals or not any(map(of_session, result.problem.parameters.free.names)):
         return ""
     sessions = {*data.session[np.isnan(held.sigmas)]} - {*result.problem.sample().data.session}

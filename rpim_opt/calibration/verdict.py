@@ -204,7 +204,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
 
 
 def ambiguous_deviation(result: Outcome) -> str:
-    """Return a sentence if errors of stated frames or of a scale look to the data like deviations of the robot.
+    """Return a sentence if data do not distinguish deviations from errors of stated frames or of a scale.
 
     A wrong length of a stated tool is a deviation of the last d, a wrong place beside the last axis one of its theta.
     """
@@ -223,7 +223,7 @@ def ambiguous_deviation(result: Outcome) -> str:
 
 
 def scatter(result: Outcome) -> str:
-    """Return a sentence if rows scatter as those of no industrial robot do; unless repeated ones show that it does."""
+    """Return a sentence if residuals exceed any industrial robot's repeatability and few rows are repeated."""
     size, ratio = residual_rms(result)["length"]
     most = REPEATABLE * arm_length(result.problem)
     blocks = result.problem.sample().data.blocks
@@ -473,11 +473,11 @@ def _cause(result: Outcome, i: int, largest: float) -> str:
     penalized = result.weight > 0 and form is not None and form.matrix[:, i].any()
     C = result.known_covariance
     if not penalized and C is not None and C[i, i] > largest**2:
-        return "Neither the data nor a penalty determine it: add a penalty on it, or do not identify it."
+        return "Neither data nor penalty determines it: add a penalty on it, or do not identify it."
     if not any(_residuals(result)):
         return (
-            "The data fit with that: check the robot file for misprints, and whether it is of this model (in a "
-            "standard DH table a and alpha stand in the row before)."
+            "The data fit with these values: check the robot file for misprints, and whether it describes this robot "
+            "(a standard DH table has a and alpha one row earlier than a modified one)."
         )
     return "Check the order, signs and units of the joint columns, and the DH table."
 
@@ -601,8 +601,8 @@ def likely_causes(result: Outcome) -> list[str]:
         causes = first(computed_columns(problem), *explanations, _residual_causes(result, problem, ordered))
         ignored = result.record.details.get("ignored_joints")
         if ignored:
-            state = "state another robot, or a tip link beyond these joints (--urdf-tip), if they move the tool"
-            causes.insert(0, f"joint values {ignored} are ignored, since the robot has {problem.robot.dof}: {state}.")
+            state = "if these move the tool, state another robot, or a tip link beyond them (--urdf-tip)"
+            causes.insert(0, f"joint values {ignored} are ignored (the robot has {problem.robot.dof} joints): {state}.")
         shared += together
     elif (other := _other_robot(result, problem)) is not None:
         causes = [other.sentence]

@@ -197,8 +197,8 @@ def underdetermined(result: Outcome) -> list[str]:
     if not names:
         return []
     return [
-        f"{joined(names)} are redundant: the data determine a combination; each value and its uncertainty rest "
-        f'on its nominal value and prior scale. State one (1 sigma): [prior] known = ["{names[-1]} = ... +- ..."].'
+        f"{joined(names)} are redundant: the data determine a combination; each value and its uncertainty depend "
+        f'on nominal value and prior scale. State one, with 1 sigma: [prior] known = ["{names[-1]} = ... +- ..."].'
     ]
 
 
@@ -212,11 +212,11 @@ def _outlying(result: Outcome, advised: bool) -> list[str]:
     if together:
         lines.append(
             f"{listed(together)} have errors like their neighbours in joint space or time: the model lacks an effect"
-            " there (model 'auto' tests compliance and gear eccentricity), or the set-up moved. --drop-outliers keeps"
+            ' there (model = "auto" tests compliance and gear eccentricity), or the set-up moved. --drop-outliers keeps'
             " them."
         )
     if advised and len(together) < len(flagged) and result.squared_loss:
-        lines.append("Outliers bias a squared loss: use formulation 'robust', or exclude them.")
+        lines.append("Outliers bias a squared loss: use formulation 'robust', or leave them out ([exclude]).")
     return lines
 
 
@@ -381,7 +381,7 @@ def touch_rows(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 
 def known_points(problem: CalibrationProblem, data: Dataset) -> list[str]:
-    """Return a sentence on touched points that the calibration used too, so are not held out."""
+    """Return a sentence on touched points that are not held out, since the calibration used them."""
     known = _touched(problem.data)
     both = [name for name in _touched(data) if name in known]
     if not both:

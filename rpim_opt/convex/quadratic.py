@@ -211,7 +211,7 @@ class Ridge:
         return (self.B * by) @ self.B.T
 
     def undetermined(self, weight: float) -> Array:
-        """Return the directions (n, u) that neither data nor penalty determine."""
+        """Return the directions (n, u) that neither data nor penalty determines."""
         if weight > 0:
             return self.null
         return np.hstack([self.null, self.B[:, ~self.identifiable]])

@@ -187,9 +187,9 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Interpretation, rows:
     yield from (f"{source.name}, {note}" for note in arm.notes)
     if exported := EXPORTED.search(files.read_bytes(source)):
         yield (
-            f"{source.name} was exported from a calibration ({exported[1].decode()}): deviations from it count as new, "
-            "and what that one left undetermined is not stated. To add measurements to it: rpim-opt update RESULTS "
-            "TABLE; to begin anew take the robot's original file."
+            f"{source.name} was exported from a calibration ({exported[1].decode()}): its values count as nominal, "
+            "without their uncertainty. To add measurements to that calibration: rpim-opt update RESULTS TABLE; to "
+            "start again, use the robot's original file."
         )
     there = "the flange's origin"
     if placed(arm.tool) != placed(np.zeros(6)):  # of a URDF, or a DH table in another convention than the modified one
@@ -208,7 +208,7 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Interpretation, rows:
     if further:
         yield (
             f"Ignored joint values: {further}. The robot ({arm.robot.source or arm.robot.name}) has {arm.robot.dof} "
-            "joints; if these move the tool, state another robot, or another link: --urdf-tip."
+            "joints; if these move the tool, state another robot, or a tip link beyond them (--urdf-tip)."
         )
     yield from (f"{text[0].upper()}{text[1:]}" for text in rows_without_values(rows, {"": arm.robot}))
 

@@ -230,7 +230,7 @@ def moved(data: ro.Dataset, rows: list[int], by: float) -> ro.Dataset:
     ("change", "said"),
     [
         (lambda r: replace(r, record=ro.data.Record()), "Missing: held-out rows"),
-        (lambda r: ro.use.update(r, r.record.validation).result, "an update identifies from all rows that it reads."),
+        (lambda r: ro.use.update(r, r.record.validation).result, "an update uses all its rows for identification."),
         (
             lambda r: replace(r, record=replace(r.record, validation=r.record.validation.take(range(3)))),
             "at least 5 held-out rows",

@@ -937,7 +937,7 @@ def test_a_size_of_the_points_is_no_cause_where_wrong_lengths_explain_them(monke
     result = ro.calibrate(wrong, ro.tikhonov, 1e-4)
     (text,) = result.verdict.reasons
     assert re.match("d4 deviates by -140 mm, a3 deviates by -90.. mm: manufacturing errors stay below 30 mm. ", text)
-    assert "The data fit with that: check the robot file" in text
+    assert "The data fit with these values: check the robot file" in text
     assert result.errors().max() < 3e-4
 
 

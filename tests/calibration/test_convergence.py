@@ -464,9 +464,9 @@ def test_a_penalty_that_leaves_redundant_parameters_out_is_the_cause_of_their_de
     offsets = ro.Formulation("joint offsets", penalty=lambda z: cp.sum_squares(z["theta?"]))
     for name, weight in (("pose", 1.0), ("pose", None), ("position", 1.0)):
         result = ro.calibrate(ro.load(name).problem, offsets, weight)
-        assert ("neither the data nor the penalty determine diverge" in result.message) == (name == "pose")
+        assert ("neither data nor penalty determines diverge" in result.message) == (name == "pose")
         (said,) = [text for text in result.verdict.reasons if "manufacturing errors" in text]
-        assert "Neither the data nor a penalty determine it: add a penalty on it" in said
+        assert "Neither data nor penalty determines it: add a penalty on it" in said
         assert "DH table" not in str(result.verdict)
 
 
