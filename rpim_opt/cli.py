@@ -142,7 +142,7 @@ Marker = Annotated[Text, Option(help="Name of the reflector, if there are severa
 UrdfBase = Annotated[Text, Option(help="Base link of the chain; default: the root of the URDF.")]
 UrdfTip = Annotated[Text, Option(help="Tip link of the chain, if there are several.")]
 Chain = Annotated[
-    str, Option(help="Name of the chain: identify the URDF's joint origins, or add a chain to a problem that does.")
+    str, Option(help="Name of a URDF chain to identify by its joint origins; further chains are added to that problem.")
 ]
 Source = Annotated[Text, Option(help="Who measured what, when, with which instrument; default: names of the files.")]
 UrKinematics = Annotated[File, Option(help="kinematics.yaml of ROS for a Universal Robot; corrected file to --out.")]

@@ -94,7 +94,7 @@ class RowError(InputError):
 
 
 class Conflict(NamedTuple):
-    """Contradictory constraints, and by how much to loosen bounds of parameters and ``stated`` constraints [SI].
+    """Contradictory constraints, and the loosening [SI] of bounds and ``stated`` constraints that removes the conflict.
 
     ``constraints`` cannot hold together, and none can be left out; ``loosen`` says by how much, of either kind.
     """

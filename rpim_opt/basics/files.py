@@ -99,7 +99,7 @@ def read_json(path: Path) -> Any:
     try:
         return parse_json(text)
     except ValueError as error:
-        raise InputError("the JSON text", str(error), "a whole JSON file", path) from None
+        raise InputError("the JSON text", str(error), "a complete JSON file", path) from None
 
 
 def parse_json(text: str) -> Any:
@@ -128,7 +128,7 @@ def sha256_of(path: Path) -> str:
 
 @contextmanager
 def writing(*paths: Path) -> Iterator[None]:
-    """Let errors of the operating system name the files that could not be written, in the place of temporary ones."""
+    """Let errors of the operating system name the files to be written instead of temporary ones."""
     try:
         yield
     except OSError as error:

@@ -64,7 +64,7 @@ JOINING = ("in", "and", "und", "et", "y", "e")
 
 @dataclass(frozen=True)
 class TableOptions:
-    """Options for reading raw tables; an empty option is detected from the files.
+    """Options for reading raw tables; what an empty option would state is detected from the files.
 
     ``sheet`` is an Excel sheet's name, or its number from 1; ``encoding``, ``separator`` and ``decimal`` are those of a
     text file: ``"cp1252"``, ``"semicolon"``, ``","``. ``columns`` are the columns' names, instead of a header; one
@@ -142,7 +142,7 @@ class RawTable:
     left: Sequence[Sequence[str]] = ()
 
     def with_constants(self, constants: Sequence[str]) -> RawTable:
-        """Return the table with columns of one value each, ``torso_lift [m]=0.15``, unless it has one of that name."""
+        """Return the table with constant columns, ``torso_lift [m]=0.15``, that it does not have already."""
         columns, own = dict(self.columns), {split(name)[0] for name in self.columns}
         for text in constants:
             name, mark, value = (part.strip() for part in text.rpartition("="))
@@ -212,7 +212,7 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     lines_of_units = [f"units above the header: {' '.join(filter(None, row))}." for row, of_row in stated if of_row]
     table = _columns(grid, full, heads, replace(options, units={**units, **options.units}))
     left = set(range(numeric[0], len(grid.rows))).difference(full)
-    lines_of_units += [f"--columns has {len(others)} names, the header {len(heads)}: the header counts."] * bool(others)
+    lines_of_units += [f"--columns has {len(others)} names, the header {len(heads)}, which is used."] * bool(others)
     notes = (*grid.notes, *_notes(grid, above, left, options), *lines_of_units, *table.notes)
     return replace(table, notes=notes, units=units, left=[grid.rows[i] for i in sorted(left)])
 
@@ -378,7 +378,7 @@ def _as_wide(grid: Grid, data: Sequence[int], width: int, options: TableOptions)
             row.pop()
         lacks_remark = len(row) == width - 1 and width > 2 and not options.separator
         if len(row) != width and not lacks_remark and (grid.mark or len(row) > width):
-            hint = "" if len(row) < width else "; decimal commas between commas need quotes"
+            hint = "" if len(row) < width else "; if commas separate cells, decimal commas need quotes"
             raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
         row += [""] * (width - len(row))
     return rows

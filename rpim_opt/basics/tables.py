@@ -418,7 +418,7 @@ def _excel(path: Path, sheet: str) -> Grid:
         raise
     except Exception as error:  # a broken file fails in zipfile, XML and openpyxl in many ways
         raise InputError("the file", _first_line(error), "a readable workbook (.xlsx, .ods)") from None
-    how = "as requested" if sheet else "the first with numbers; another one, or several, by --sheet"
+    how = "as requested" if sheet else "the first with numbers; --sheet selects others"
     notes = (f"sheet '{chosen}' of {', '.join(names)}: {how}.",) if len(names) > 1 else ()
     return Grid([row for _, row in rows], [number for number, _ in rows], notes)
 

@@ -24,7 +24,7 @@ def cores() -> int:
 
 
 def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> list[Answer]:
-    """Return a function's results for items, in their order, from all cores; inside one of its threads one by one."""
+    """Return a function's results for items, in their order, computed on all cores; serially in a worker thread."""
     waiting = list(items)
     workers = min(cores(), len(waiting))
     if workers < 2 or threading.current_thread().name.startswith(WORKER):

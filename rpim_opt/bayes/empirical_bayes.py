@@ -45,7 +45,7 @@ class Estimated:
 
 
 def estimate(problem: Source, estimator: Estimator, model: str, start: Array | None, keep: bool = False) -> Estimated:
-    """Estimate hyperparameters, outliers, and of the model ``"auto"`` extensions, from a start (n,) [SI] or None.
+    """Estimate hyperparameters, outliers and, with the model ``"auto"``, extensions, from a start (n,) [SI] or None.
 
     Outliers are left out of the problem, unless the loss has to ``keep`` the rows that it knows.
     """
@@ -87,7 +87,7 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
         left_out = [ExcludedRow(label, ratio, *errors[label]) for label, ratio in worst_first]
         if keep:
             kept = listed([str(row) for row in left_out], 5)
-            notes += (f"Outliers, kept because the loss depends on the order of its equations: {kept}.",)
+            notes += (f"Outliers, kept since the loss depends on equation order: {kept}. Leave them out ([exclude]).",)
             left_out = []
         else:
             laid = laid.without(outliers)

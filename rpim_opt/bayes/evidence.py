@@ -64,7 +64,7 @@ class Spectrum(NamedTuple):
         return tuple(CURVES) * (len(self.w2) > 0)
 
     def variances(self, size: float, length: float) -> tuple[Array, Array, Array]:
-        """Return variances (c,) at logarithms of ripple's size and length, slopes (c, 2) and curvature of ln."""
+        """Return variances (c,) at logarithms of size and length, slopes (c, 2) and curvature of their ln."""
         r2, slow = 3 * np.exp(-2 * length), 3 / WAVES_LENGTH**2
         ripple = np.exp(2 * size) * 8 * r2**1.5 / (r2 + self.w2) ** 2
         waves = WAVES**2 * 8 * slow**1.5 / (slow + self.w2) ** 2
@@ -407,7 +407,7 @@ class Evidence:
         return sorted(known, key=lambda point: point.value)
 
     def starts(self) -> list[Array]:
-        """Return the starts of the search: all residuals noise, and for few data prior medians and large deviations."""
+        """Return the starts of the search: all residuals noise; for few data also prior medians, large deviations."""
         noisy = 3.0 * np.isin(self.names, self.noise)
         geometry = 2.0 * np.isin(np.arange(len(self.centre)), self.prior.geometry)
         starts = [self.centre + noisy, self.centre, self.centre + geometry]
@@ -419,7 +419,7 @@ class Evidence:
         return replace(self, data=replace(self.data, X=self.data.X[:, keep]), prior=self.prior.of(keep))
 
     def overdispersion(self, point: Point, q: Array) -> Array:
-        """Return by which factors k >= 1 (joints,) the covariance C is too small, with joint values q (m, joints).
+        """Return the factors k >= 1 (joints,) by which the covariance C is too small, with joint values q (m, joints).
 
         What a model lacks repeats from row to row, so that C, which takes it for chance, is too small; inside the
         measured ranges the noise covers it. Equations in either half of a joint's range predict those in the other one

@@ -75,7 +75,7 @@ class ExcludedRow(NamedTuple):
 
 
 class Transmitted(NamedTuple):
-    """Standard deviation and length scale of ripple [rad], and the decrease of -2 ln L."""
+    """Standard deviation and length scale of transmission errors [rad], and the decrease of -2 ln L."""
 
     size: Hyperparameter
     length: Hyperparameter
@@ -285,7 +285,7 @@ def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:
 def require_finite(*arrays: Array) -> None:
     """Refuse non-finite residuals or derivatives."""
     if not all(np.isfinite(values).all() for values in arrays):
-        accepted = "finite measurements and a finite model; own terms call CasADi's functions (ca.sin, not math.sin)"
+        accepted = "finite measurements and a finite model; user-defined terms need ca.sin, not math.sin"
         raise InputError("data", "non-finite residuals or derivatives", accepted)
 
 
@@ -330,8 +330,9 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     heavy = np.flatnonzero(prior.heavy & ~prior.replaced)
     scales = np.sqrt(prior.variances(point.logs)[0][heavy])
     notes = []
-    if (np.abs(point.logs - evidence.centre) > FARTHEST - 0.01).any():
-        notes.append("A hyperparameter is implausibly far from its prior median: check units, scales and stated noise.")
+    far = np.array(evidence.names)[np.abs(point.logs - evidence.centre) > FARTHEST - 0.01].tolist()
+    if far:
+        notes.append(f"Implausibly far from prior medians: {joined(far)}. Check units, scales and stated noise.")
     vague = [i for i in prior.geometry if spread[i] > VAGUE]
     if vague:
         names = joined([prior.names[i] for i in vague])

@@ -179,7 +179,7 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
 
 
 def complexity(extensions: Sequence[str]) -> int:
-    """Return the complexity of a model: one for all of `CANDIDATES` that it has, one for every other extension."""
+    """Return the number of extensions of a model, all of `CANDIDATES` counted as one."""
     others = sum(extension in FURTHER or extension in CONDITIONS for extension in extensions)
     return others + (len(extensions) > others)
 

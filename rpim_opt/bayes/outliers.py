@@ -56,7 +56,7 @@ def error_vectors(problem: CalibrationProblem, x: Array) -> Array:
 
 
 def largest_errors(problem: Source, x: Array) -> list[tuple[float | None, str]]:
-    """Return the error [SI] of every row at x (n,) [SI] in the dimension where it is more times the median, and that.
+    """Return every row's error [SI] at x (n,) [SI] in the dimension of largest ratio to the median, and that dimension.
 
     None for rows without length and angle; what is known of a distance counts as its length.
     """

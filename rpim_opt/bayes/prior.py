@@ -142,7 +142,7 @@ class Prior:
         return cls(centre=centre, scale=width, optional=tuple(centre))
 
     def where_known(self, stated: Parameters, found: Parameters) -> Parameters:
-        """Return the table that was found, with known frames and known parameters at their stated values.
+        """Return the located parameters, with known frames and known parameters at their stated values.
 
         Of an orientation, and of frames with a scale of their own that is no wider than that of the table, too.
         """

@@ -54,7 +54,7 @@ def certified(
     floor: float = 0.0,
     residual: Callable[[Array], Array] | None = None,
 ) -> Certificate:
-    """Return the certificate that z (n,) minimizes the nonlinear problem; the formulation's functions are called anew.
+    """Return the certificate that z (n,) minimizes the nonlinear problem; the formulation's functions are called again.
 
     ``model`` is the problem linearized at z, anew; ``floor`` the objective below which one has vanished. Where
     ``residual`` gives the whitened residual b - A z at z (n,), the model's derivative is compared with its differences,

@@ -42,7 +42,7 @@ def coverage_text(held: HeldOut) -> str:
 
 
 def registration(free: Parameters, data: Dataset) -> str:
-    """Return the prefix of the frame that says where rows were measured: the base, or without it that of a session."""
+    """Return the prefix of the frame to register rows by: the base, or a session if only sessions are identified."""
     based = any(name.startswith("base_") for name in free.names)
     return "base_" if based or not any(map(of_session, free.names)) else session_prefix(str(data.session[0]))
 

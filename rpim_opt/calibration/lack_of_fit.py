@@ -37,7 +37,7 @@ TOGETHER = (
 
 
 class Extension(NamedTuple):
-    """A model extension: its parameter patterns, what it is called when missing, the same when present, and its terms.
+    """A model extension: its parameter patterns, its name, a sentence on its effect, and its terms.
 
     Terms whose evidence is asked for at a result; first moments of links are gravity's, as either stands for the other.
     """

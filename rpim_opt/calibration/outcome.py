@@ -80,7 +80,7 @@ class Prediction(NamedTuple):
 
     @property
     def expanded(self) -> Array:
-        """Expanded uncertainties U = k u (N, 3) [m] of the coordinates: half widths of their intervals."""
+        """Expanded uncertainties U = k u (N, 3) [m] of the coordinates: half-widths of their intervals."""
         return self.coverage_factor * self.standard
 
 

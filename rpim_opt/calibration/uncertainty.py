@@ -73,7 +73,7 @@ class Uncertainty(Tabled):
 
     @property
     def expanded(self) -> Array:
-        """Expanded uncertainties U = k u (n,) [SI] of the deviations: half widths of their intervals."""
+        """Expanded uncertainties U = k u (n,) [SI] of the deviations: half-widths of their intervals."""
         return self.coverage_factor * np.sqrt(np.diag(self.result.covariance))
 
     def _short(self) -> str:

@@ -145,7 +145,7 @@ def weight_lines(result: Outcome) -> list[str]:
 
 
 def remarks(result: Outcome, verdict: Verdict) -> list[str]:
-    """Return remarks on outliers, active bounds, an assumed noise and convergence; no advice beside reasons."""
+    """Return remarks on outliers, active bounds, an assumed noise and convergence; advice only if delivered."""
     lines = _outlying(result, verdict.delivered)
     for held in [held for held in result.active_bounds if held.bound][:MOST_BOUNDS]:
         parameters = result.problem.parameters
@@ -159,7 +159,7 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
     if len(beyond):
         names = listed([result.problem.parameters.free.names[i] for i in beyond])
         lines.append(
-            f"Deviations beyond the tolerance ([tolerance]): {names}. Only formulation 'bounded' enforces them."
+            f"Deviations beyond the tolerance ([tolerance]): {names}. Only formulation 'bounded' enforces tolerances."
         )
     lines += [price.sentence() for price in result.shadow_prices]
     if result.active_constraints and not result.contradiction:  # which says it

@@ -124,7 +124,7 @@ class Program(Brief):
         return f"'{self.formulation.name}' on {self.model._short()}"
 
     def on(self, model: LinearModel) -> Program:
-        """Return the program for another model of the same shape, without calling the functions anew."""
+        """Return the program for another model of the same shape, without calling the functions again."""
         return Program(self.formulation, model, self.structure, self._warm)
 
     def on_squares(self, model: LinearModel) -> Program:

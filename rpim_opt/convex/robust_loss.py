@@ -1,4 +1,4 @@
-"""The squares that a robust fit amounts to, for rules, covariances and blocks; `solvers.separable` solves it."""
+"""Equivalent least squares of a robust fit, for rules, covariances and blocks; `solvers.separable` solves the fit."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def by_place(formulation: Formulation, groups: np.ndarray) -> bool:
 
 @dataclass(frozen=True)
 class QuadraticModel:
-    """Replaces a loss that is a sum over rows by squares, some equations at a time: a `Reweigh` for blocks.
+    """Quadratic model of a loss that is a sum over rows, for blocks of equations: a `Reweigh`.
 
     With r_i the residual of a configuration (or of an equation) at z, v = |r_i|, u = r_i / v and w = loss'(v) / (2 v),
     the equations of i are multiplied by M and their right-hand side is moved such that ::
@@ -149,7 +149,7 @@ class QuadraticModel:
     before: Array | None = None
 
     def after(self, z: Array) -> QuadraticModel:
-        """Return the squares for the iteration after z (n,)."""
+        """Return the quadratic model for the iteration after z (n,)."""
         return replace(self, before=z)
 
     def __call__(self, model: LinearModel, z: Array) -> tuple[LinearModel, float]:

@@ -291,7 +291,7 @@ class Structure:
 
     @cached_property
     def inner(self) -> bool:
-        """Whether loss or penalty have variables of their own: a value is a minimum over them."""
+        """Whether loss or penalty has variables of its own, over which a value is the minimum."""
         if self._declared:
             return False
         a = self.expressions
@@ -381,7 +381,7 @@ def structure(
 
 
 def in_blocks(formulation: Formulation) -> tuple[Formulation, QuadraticModel | None]:
-    """Return the formulation by which blocks of rows are solved, and what makes its squares of their equations.
+    """Return the formulation for blocks of rows, and the quadratic model of its loss; None if it needs none.
 
     A loss that sees only the length of the residual needs nothing. InputError for one that is no sum over rows.
     """

@@ -56,7 +56,7 @@ class Block(Brief):
 
     @property
     def touched(self) -> np.ndarray | None:
-        """(N, p) names of the points that were touched; None for what a camera has seen."""
+        """(N, p) names of the touched points; None for views of a camera."""
         return None if self.measurement.by_camera else self.point
 
     @property
@@ -158,7 +158,7 @@ class Dataset(Tabled):
         return np.concatenate([np.zeros(0), *columns])
 
     def by_session(self) -> list[np.ndarray]:
-        """Return the configurations (k,) of every session, of those that share one together, and of unnamed rows."""
+        """Return the configurations (k,) of every session, or group of sessions with common configurations."""
         part = _united(_numbered(self.session), np.arange(len(self)), self.configuration)
         return [np.unique(self.configuration[part == i]) for i in range(part.max() + 1)]
 

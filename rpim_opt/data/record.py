@@ -71,7 +71,7 @@ class Requirement:
 
 
 class Fit(NamedTuple):
-    """Chi-squared of readings about what a calibration predicts of them, over how many equations, and its p-value."""
+    """Chi-squared of readings about their predictions, its number of equations, and its p-value."""
 
     squares: float
     equations: int
@@ -79,7 +79,7 @@ class Fit(NamedTuple):
 
     @classmethod
     def of(cls, squares: float, equations: int, dof: float) -> Fit:
-        """Return the fit by Fisher's F, with predictions whose noise is known to so many degrees of freedom."""
+        """Return the fit by Fisher's F, with predictions whose noise has ``dof`` degrees of freedom."""
         return cls(squares, equations, float(fdtrc(equations, max(dof, 1.0), squares / equations)))
 
     @property

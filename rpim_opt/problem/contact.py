@@ -70,7 +70,7 @@ class Feature:
 
     @property
     def level(self) -> Feature:
-        """The feature with all points on it, planes parallel as stated: nominal errors are not taken for noise."""
+        """The feature without nominal errors: all touches on it, planes exactly parallel where stated."""
         return replace(self, height=np.zeros_like(self.height), axis=None)
 
     @cached_property

@@ -171,6 +171,5 @@ def require_affordable(problem: Source) -> None:
         raise InputError(
             "session",
             f"{len(sessions)} of them and {len(names):,} parameters, which would take about {minutes:.0f} minutes",
-            f"{MOST_PARAMETERS:,} parameters: one name for sessions of the same set-up, or `identify` without "
-            "session_*",
+            f"at most {MOST_PARAMETERS:,}: one name for sessions of the same set-up, or `identify` without session_*",
         )

@@ -266,7 +266,7 @@ class CalibrationProblem(RobotModel):
         N = len(q)
         turning = [dimension == "angle" for dimension in arm.robot.joint_dimensions]
         if q.ndim != 2:
-            accepted = f"(N, {len(turning)}), a configuration a row: q[:, 0] of a block, whose q has points, too"
+            accepted = f"(N, {len(turning)}), one row per configuration: q[:, 0] for a block with q (N, points, dof)"
             raise InputError("q", f"shape {q.shape}", accepted)
         if q.shape[-1] == len(turning) and np.abs(q[:, turning]).max(initial=0.0) > MOST_TURNS * 2 * np.pi:
             found = f"{np.abs(q[:, turning]).max():.6g} rad"
@@ -301,7 +301,7 @@ class CalibrationProblem(RobotModel):
         return self
 
     def rows(self) -> Iterator[CalibrationProblem]:
-        """Yield problems that together have all the rows: here this one, of measurements in blocks one per block."""
+        """Yield problems that together have all the rows: this one; for measurements in blocks, one per block."""
         yield self
 
     @property

@@ -309,7 +309,7 @@ def require_known_masses(robot: Robot, parameters: Parameters, data: Dataset, pa
 
 
 def repeated(block: Block) -> np.ndarray:
-    """Return the number (N,) of what rows measured: the same where joint values and a model's own columns are."""
+    """Return numbers (N,) of what rows measured: equal where joint values and the model's columns are equal."""
     seen = [block.columns[name][:, None] for name in block.measurement.depends_on if name in block.columns]
     same = np.hstack([block.q.reshape(len(block.row), -1), *seen]).round(7)
     return np.unique(same, axis=0, return_inverse=True)[1].ravel()  # a column in NumPy 2.0

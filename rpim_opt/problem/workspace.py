@@ -169,7 +169,7 @@ class Target(NamedTuple):
     damping: float = DAMPING
 
     def reached(self, count: int, rng: np.random.Generator, share: float) -> tuple[Array, int | None]:
-        """Return joint values (N, dof) [rad or m] of so many rows, and the row that is out of reach, if there is one.
+        """Return joint values (``count``, dof) [rad or m], and the row that is out of reach, if there is one.
 
         A configuration that does not get there is drawn again, from a share of the ranges; rows do not depend on each
         other. What processors differ by in rounding grows 100 times at worst, to a thousandth of what a table prints.

@@ -350,7 +350,7 @@ def _diagnostics(content: Content) -> Iterator[Block]:
     yield "heading", "Identifiability"
     yield from _identifiability(result)
     yield "heading", "Flagged and excluded rows"
-    status = "flagged, in the data"
+    status = "flagged, not excluded"
     flagged = result.flagged
     rows = [[f.label, f"{f.sigmas:.1f}", in_unit(f.error, f.dimension), status] for f in flagged[:MOST_FLAGGED]]
     if len(flagged) > MOST_FLAGGED:

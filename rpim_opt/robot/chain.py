@@ -179,7 +179,7 @@ def joint_values(robot: Robot, original: Robot, file: Path) -> list[str]:
         places.append(f"joint {original.joint(i)} is at {' '.join(terms)}")
     if not places:
         return []
-    return [f"{file.name}: with the calibration's joint values q its {joined(places)}; the file cannot state this."]
+    return [f"{file.name}: for joint values q of the calibration, its {joined(places)}; the file cannot express this."]
 
 
 def without_beta(robot: Robot) -> Robot:

@@ -56,7 +56,7 @@ UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above whi
 
 
 class Started(NamedTuple):
-    """A new folder: rows by file, notes on guesses, what was understood of tables; not ``written`` by a dry run."""
+    """A new folder: rows by file, notes on guesses, the interpretation of tables; not ``written`` by a dry run."""
 
     folder: Path
     rows: Mapping[str, int]
@@ -402,7 +402,7 @@ def _base(arm: RobotSetup, rows: Dataset, tools: Mapping[str, Array], kind: Meas
     """Return the base to state, None for registration, and why."""
     rows = with_poses(rows, starting_cameras(rows, {}))
     if not any(block.measurement.registers for block in rows.blocks):
-        return arm.base, "The base is that of the robot's file: these measurements do not depend on it."
+        return arm.base, "The base is that of the robot file: these measurements do not depend on it."
     located, _, verdict = locate(arm.robot, rows, tools)
     if same_place(located, arm.base):
         offset = 1e3 * np.linalg.norm(located[:3] - arm.base[:3])

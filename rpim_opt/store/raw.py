@@ -66,7 +66,7 @@ class Interpretation:
 
     @property
     def texts(self) -> dict[str, list[str]]:
-        """The ignored columns that hold more than numbers, as the files have them."""
+        """The ignored columns that hold more than numbers, unchanged."""
         cells = {name: [str(cell) for cell in self.raw.get(name.lower(), ())] for name in self.left_out}
         return {name: own for name, own in cells.items() if not all(map(is_numeral, filter(None, own)))}
 
@@ -97,7 +97,7 @@ class Interpretation:
 
 
 def usual_noise(kind: Measurement) -> dict[str, float]:
-    """Return standard deviations for data that state none, as ``[noise]`` has them."""
+    """Return standard deviations for data that state none, as keys of ``[noise]``."""
     usual = {"length": ("mm", 0.05), "angle": ("mrad", 0.5), "pixel": ("px", 0.2)}
     return {f"{name}_{usual[dimension][0]}": usual[dimension][1] for name, dimension in kind.noise.items()}
 

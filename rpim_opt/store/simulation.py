@@ -155,7 +155,7 @@ class _Table:
     noisy: bool
 
     def made(self, random: Array) -> tuple[Columns, list[str]]:
-        """Return the columns as text, and the labels of blunders; of joint values (2 count, dof) [rad or m]."""
+        """Return the columns as text, and the labels of blunders, from joint values (2 count, dof) [rad or m]."""
         if self.kind.touching:
             return self._touched(), []
         if self.kind.by_camera:

@@ -106,9 +106,7 @@ def compare(
     numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0)
     figured = metrics_of(metrics)
     if next(iter(figured)) == COVERED:
-        raise InputError(
-            "metrics", f"'{COVERED}' first, of which 95 is best", "a first metric of which smaller values are better"
-        )
+        raise InputError("metrics", f"'{COVERED}' first, of which 95 is best", "a first metric to minimize")
 
     def work(case: Mapping[str, Any]) -> studies.Work:  # which takes no more along than it needs
         return partial(
@@ -212,7 +210,7 @@ class Comparison:
         metric = metric or self.metric
         ranked = [name for name in self.metrics if name != COVERED]
         if metric not in ranked:
-            raise InputError("metric", f"'{metric}'", f"one of which less is better: {choices(metric, ranked)}")
+            raise InputError("metric", f"'{metric}'", f"one to minimize: {choices(metric, ranked)}")
         of = figures(self.rows, metric)
         with_figures = [method for method, values in of.items() if values]
         reference = against or next(iter(with_figures), self.methods[0])

@@ -45,7 +45,7 @@ Problem = Instance | Callable[[int], Any]  # a problem, or a function of a seed 
 
 
 def listed(stated: Any) -> list[tuple[str, Any]]:
-    """Return what stands alone, in a list or under names, with its name, which is empty without one."""
+    """Return one object, a list or a mapping as pairs of name and object; names are empty except in a mapping."""
     if isinstance(stated, Mapping):
         return [(str(label), each) for label, each in stated.items()]
     if isinstance(stated, str) or callable(stated) or not isinstance(stated, Iterable):

@@ -312,7 +312,7 @@ def _resumed(path: Path, code: Mapping[str, str], resume: bool | None) -> dict[s
 
 
 def compute(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[tuple[str, Row]]:
-    """Yield keys and results as they are finished; ``workers`` are as `compare` has them."""
+    """Yield keys and results as they are finished; ``workers`` as in `compare`."""
     if workers == 0:
         raise InputError("workers", "0", "one or more, or -1 for all processors")
     if workers == 1:

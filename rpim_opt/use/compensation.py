@@ -139,7 +139,7 @@ class Compensation:
         lines += [said.format(count, len(self.q), what) for what, count in counts.items() if count]
         if len(self.missed) > uncertain and np.isfinite(self.orientation_error).any():
             lines.append(
-                "Without --orientation, position has priority; with --position-only only the position is corrected."
+                "Without --orientation, position has priority; --position-only ignores the targets' orientations."
             )
         vague = EXPANDED * self.std > self.position_before
         if vague.mean() > 0.5 and np.isfinite(self.std).all():
@@ -368,7 +368,7 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
 
 
 def turns_measured(problem: CalibrationProblem) -> bool:
-    """Return whether orientations were measured, or several reflectors, which show them."""
+    """Return whether orientations were measured, or several reflectors, which determine them."""
     several = len(reflectors(problem.parameters.names)) > 1
     return several or any(block.measurement.turning for block in problem.data.blocks)
 
@@ -444,9 +444,9 @@ class _Cell:
         else:
             place = finite_numbers("tool", tool, (6,))
             self.point = (
-                f"Target point: the stated tool, at {placed(place)} in the flange frame. Its U contains what the data "
-                "do not tell of the flange: to lower it, measure a reflector as far from the flange, or state what is "
-                "known of that (`known` in [prior])."
+                f"Target point: the stated tool, at {placed(place)} in the flange frame. Its U includes what the data "
+                "do not determine of the flange: to reduce it, measure a reflector as far from the flange as this "
+                "tool, or state what is known of the reflector (`known` in [prior])."
             )
         p = replace(p, nominal=p.nominal.copy(), identified=p.identified.copy())
         p.nominal[at], x[at] = place, 0.0

@@ -82,7 +82,7 @@ class Performance(Tabled):
         lines: list[str] = []
         cycles = sorted({each["cycles"] for each in self.poses})
         if cycles[0] < CYCLES or len(self.poses) < POSES:
-            found = f"{counted(len(self.poses), 'pose')}, the least with {cycles[0]} approaches"
+            found = f"{counted(len(self.poses), 'pose')}, with at least {cycles[0]} approaches each"
             lines.append(f"The standard requires {POSES} poses, {CYCLES} approaches each: the table has {found}.")
         if self.accuracy is None:
             lines.append("No commanded poses are known: repeatability is computed, accuracy is not.")

@@ -306,7 +306,7 @@ def cusum(deviate: Array) -> Array:
 
 
 def cusum_limit(count: int, level: float) -> float:
-    """Return what sums of so many normal deviates exceed with probability ``level`` (Brook and Evans 1972)."""
+    """Return the limit that sums of ``count`` normal deviates exceed with probability ``level`` (Brook, Evans 1972)."""
 
     def alarms(limit: float) -> float:
         """Return by how much the probability of an alarm exceeds the level."""
@@ -352,12 +352,12 @@ class _Explanations:
         self.priors = dict(zip(causes, recalibration.log_priors(causes).tolist(), strict=True))
 
     def columns(self, drift: Drift) -> Array:
-        """Return the effect (m, c) of a change: of one that is steady, a part of the whole on every reading."""
+        """Return the effect (m, c) of a change: from its first check on, or linear over the checks if it is steady."""
         course = self.when / (self.count - 1) if drift.steady else self.when >= drift.first
         return self.A[:, self._places(drift.cause)] * course[:, None]
 
     def misfit(self, kept: Array, beside: Drift | None = None) -> recalibration.Misfit:
-        """Return the misfit of the equations that are kept (m, 1), beside a change."""
+        """Return the misfit of the equations that are kept (m, 1), with a change if one is given."""
         columns = self.columns(beside) * np.sqrt(self.result.variance_factor) if beside else np.zeros((len(kept), 0))
         model = replace(self.model, A=np.hstack([self.model.A, columns]) * kept, b=self.model.b * kept[:, 0])
         wide = np.pad(self.form.matrix, ((0, 0), (0, model.A.shape[1] - self.form.matrix.shape[1])))

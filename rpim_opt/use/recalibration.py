@@ -138,7 +138,7 @@ class Update:
 
     @cached_property
     def lacking(self) -> str:
-        """A sentence on an effect that the model lacks by the new rows, and what to do; empty without one."""
+        """A sentence on an effect that new rows show and the model lacks, with the remedy; empty if there is none."""
         if not (fit := judged(self.result)):
             return ""
         return " ".join(line for line in fit.sentences() if TOGETHER in line)
@@ -552,7 +552,7 @@ def penalty_of(formulation: Formulation, n: int) -> Quadratic:
 
 
 def by_visit(data: Dataset, visit: np.ndarray | None = None) -> Dataset:
-    """Return checks with one configuration a visit (N,): a place that is reached again was read and reached anew.
+    """Return checks with one configuration per visit (N,): returning to a place is another configuration.
 
     Without ``visit`` these are runs of equal configurations.
     """
@@ -717,7 +717,7 @@ class Misfit:
 
 
 def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -> list[Cause]:
-    """Return the candidate changes: parameters of the robot, frames and transmission errors as a whole; none reset.
+    """Return the candidate changes: parameters, whole frames and whole transmission errors that were not reset.
 
     A motor that moves several joints shifts all their zeros, and a plate moves all its reflectors. A link that is
     ``bent`` changes all six numbers between its joints, which explain most of what moves a frame.

@@ -45,7 +45,7 @@ def in_session(result: Calibration, robot: str = "") -> Calibration:
 
 
 def set_ups(result: Calibration, data: Dataset) -> list[str]:
-    """Return the sessions that ``register`` is for: those that the calibration does not have, or without such, all."""
+    """Return the sessions that ``register`` refers to: those new to the calibration, or all if there are none."""
     return sorted({*data.session} - {*result.problem.sample().data.session}) or sorted({*data.session})
 
 

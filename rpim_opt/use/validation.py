@@ -26,7 +26,7 @@ from rpim_opt.use.sessions import registered_again
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Validation(HeldOut):
-    """Errors of a calibration on N new measurements, as `HeldOut` has them, and what else they show.
+    """Errors of a calibration on N new measurements, with the fields of `HeldOut`, and what else they show.
 
     ``data`` are the measurements, ``vectors`` (N, 3) measured minus predicted position [m], NaN where no position was
     measured. ``outside`` are rows beyond the joint ranges that the calibration measured, ``touched`` is how far

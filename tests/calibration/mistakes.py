@@ -478,7 +478,7 @@ IN_TABLES |= {
         "distance, azimuth, zenith angle in gon: convert the angles to azimuth and elevation in degrees, and name the "
         "columns distance_mm, azimuth_deg, elevation_deg",
     ),
-    "joint 2 moved by a thousandth of 1": (coupled(1, 0, 1e-3), "no gears have so small a ratio: have bearings"),
+    "joint 2 moved by a thousandth of 1": (coupled(1, 0, 1e-3), "no gear has so small a ratio: check bearings"),
     "the last joint half a turn off in rows": (
         of_joint_rows(
             lambda q: q + np.pi * np.outer(np.arange(len(q)) % 3 == 1, np.arange(q.shape[1]) == q.shape[1] - 1)

@@ -924,7 +924,7 @@ def test_the_unit_of_the_robots_file_is_named_where_parameters_take_the_error_up
     """What is left is measured by the points, as 0.3 % of an arm in inches is less than a robot's errors."""
     wrong = mistakes.dh_table(lambda mdh: mdh / [1, 25.4, 1, 25.4, 1])(simulated_arm("irb120"))
     causes = likely_causes(ro.calibrate(wrong, ro.tikhonov, 1e-6))
-    assert "or correct the robot's file, if its unit is wrong" in causes[1]
+    assert "or correct the robot file, if its unit is wrong" in causes[1]
 
 
 @pytest.mark.slow
@@ -1208,7 +1208,7 @@ def test_a_robot_file_in_another_unit_is_named_before_single_rows(factor: float,
     nominal = p.nominal * np.where(of_file, factor, 1.0)
     wrong = replace(problem, robots=robot, parameters=replace(p, nominal=nominal))
     cause = next(text for text in likely_causes(calibrated(wrong)) if text.startswith("Likely"))
-    assert f"robot lengths {said}: correct the unit of the robot's file" in cause
+    assert f"robot lengths {said}: correct the unit of the robot file" in cause
 
 
 @pytest.mark.slow

@@ -422,7 +422,7 @@ def test_a_loss_that_knows_its_equations_keeps_outliers_and_says_so() -> None:
     assert result.verdict.reasons == (
         "Likely: outliers bias a loss that depends on the order of its equations: leave out c3, c7.",
     )
-    assert "Outliers, kept because the loss depends on the order of its equations: c7 (" in str(result)
+    assert "Outliers, kept since the loss depends on equation order: c7 (" in str(result)
     without = ro.calibrate(problem.without(["c3", "c7"]), ro.Formulation("sum", lambda r: cp.sum(r**2), cp.sum_squares))
     assert without.verdict.delivered
 

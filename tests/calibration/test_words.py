@@ -178,7 +178,7 @@ def test_deviations_beyond_a_tolerance_that_nothing_bounds_are_named() -> None:
     tight = instance.problem.with_parameters(instance.problem.parameters.toleranced({"length_mm": 0.01}))
     free = ro.calibrate(tight, ro.tikhonov, 1e-3)
     (line,) = [line for line in words.remarks(free, free.verdict) if "tolerance" in line]
-    assert line.endswith("Only formulation 'bounded' enforces them.")
+    assert line.endswith("Only formulation 'bounded' enforces tolerances.")
     assert "d4" in line
     bounded = ro.calibrate(tight, ro.bounded, 1e-3)
     assert not [line for line in words.remarks(bounded, bounded.verdict) if line.startswith("Beyond")]

@@ -216,7 +216,7 @@ def test_a_result_keeps_its_mapping(tmp_path) -> None:
     ro.store.save_result(result, tmp_path / "result.json")
     again = ro.load_result(tmp_path / "result.json")
     assert again.mapping.sentence == result.mapping.sentence
-    assert "add the zeros to theta_deg (or theta_rad), of" in result.verdict.caution
+    assert "add their zeros to theta_deg (or theta_rad)" in result.verdict.caution
     assert "joint 2 (Arm_B) reversed (sign = -1), zero of joint 2 (Arm_B) -18.9 deg. " in result.verdict.caution
     assert np.allclose(again.errors(unseen), result.errors(unseen))
     assert again.without_flagged().mapping is not None

@@ -42,7 +42,7 @@ def changed(name: str, q=lambda q: q, y=lambda y: y) -> ro.CalibrationProblem:
 MISTAKES = {
     "degrees as radians": ("position", {"q": np.degrees}, "degrees, not radians"),
     "millimetres as metres": ("position", {"y": lambda y: 1e3 * y}, "a thousand times smaller"),
-    "millimetres as inches": ("position", {"y": lambda y: 25.4 * y}, "or correct the robot's file"),
+    "millimetres as inches": ("position", {"y": lambda y: 25.4 * y}, "or correct the robot file"),
     "lengths in an unknown unit": ("position", {"y": lambda y: 1.37 * y}, "multiply all measured lengths by 0.72"),
     "a column a row too high": (
         "position",

@@ -384,7 +384,7 @@ def test_only_tolerances_that_were_kept_are_shown() -> None:
     loose = ro.calibrate(instance.problem, ro.tikhonov, 1.0)
     assert "tolerance" in Reader(page(kept)).words
     words = Reader(page(loose)).words
-    said = "Deviations beyond the tolerance ([tolerance]): a5. Only formulation 'bounded' enforces them."
+    said = "Deviations beyond the tolerance ([tolerance]): a5. Only formulation 'bounded' enforces tolerances."
     assert said in words
     assert "tolerance" not in words.replace(said, "")  # no column of them
 

@@ -579,7 +579,7 @@ def test_the_offset_of_a_clock_is_named_by_where_the_robot_stands_still(
     if abs(late) < 0.7:
         assert "the robot moved" not in said  # within the shortest stop
         return
-    low, high = re.search(r"It stands still if .* s \((.\d\.\d+) to (.\d\.\d+)\) are added", said).groups()
+    low, high = re.search(r"The robot is at rest if .* s \((.\d\.\d+) to (.\d\.\d+)\) are added", said).groups()
     assert float(low) < -late < float(high)
 
 
@@ -593,7 +593,7 @@ def test_rows_without_a_partner_in_time_are_counted(monkeypatch, capsys, tmp_pat
 
 @pytest.mark.parametrize(
     ("shift", "within", "said"),
-    [(5000.0, "0.01", "no two within 0.01 s"), (0.0, "-1", "zero or more"), (0.0, "nan", "zero or more")],
+    [(5000.0, "0.01", "none within 0.01 s"), (0.0, "-1", "zero or more"), (0.0, "nan", "zero or more")],
 )
 def test_clocks_that_do_not_agree_are_one_sentence(monkeypatch, capsys, tmp_path, arm, shift, within, said) -> None:
     files = clocked(tmp_path, rate=100.0, apart=0.0, shift=shift)

@@ -43,7 +43,7 @@ def test_what_has_no_figures_is_named_and_nothing_is_summed_up() -> None:
     for against, said in (("c", "against: found 'c'"), ("b", "'b', which has no results")):
         with pytest.raises(ro.InputError, match=said):
             some.summary(against=against)
-    with pytest.raises(ro.InputError, match="metric: found 'max_mm', accepted: one of which less is better: rms_mm"):
+    with pytest.raises(ro.InputError, match="metric: found 'max_mm', accepted: one to minimize: rms_mm"):
         some.summary("max_mm")
 
 
@@ -52,7 +52,7 @@ def test_coverage_is_a_column_and_ranks_nothing() -> None:
     found = ro.compare("position", selectors=[1.0, 2.0], metrics=["rms_mm", "covered_percent"], progress=False)
     assert found.rows[0]["covered_percent"] > 80
     for ranked in (found.summary, found.plot):
-        with pytest.raises(ro.InputError, match="found 'covered_percent', accepted: one of which less is better: rms"):
+        with pytest.raises(ro.InputError, match="found 'covered_percent', accepted: one to minimize: rms"):
             ranked("covered_percent")
 
 

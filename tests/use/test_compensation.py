@@ -200,7 +200,7 @@ def test_poses_that_are_unreachable_name_the_option_by_which_position_alone_coun
     for poses, named in ((far, True), (np.array(far)[:, :3], False)):
         found = ro.use.compensate(result, poses=np.array(poses), despite_verdict=True)
         assert found.missed == ["1"]
-        assert ("with --position-only only the position is corrected." in str(found)) == named
+        assert ("--position-only ignores the targets' orientations." in str(found)) == named
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -659,7 +659,9 @@ def test_a_limit_holds_for_what_is_left_and_its_uncertainty() -> None:
     assert f"{above.sum()} of 10 commands reach their target by the model" in said
     assert "miss their target" not in said
     for text in (said, str(known_to)):  # with and without a limit
-        assert "measure a reflector as far from the flange, or state what is known of that" in text
+        assert (
+            "measure a reflector as far from the flange as this tool, or state what is known of the reflector" in text
+        )
 
 
 def test_a_common_motion_of_all_targets_is_told_from_what_is_uncertain_beside_it() -> None:

@@ -75,7 +75,7 @@ def test_a_table_of_coupled_joints_says_how_the_controller_counts_them(tmp_path:
     result = replace(ro.calibrate(problem, "tikhonov", 1.0), x=truth)
     file = tmp_path / "arm.csv"
     notes = " ".join(ro.use.export_files(result, **{**made, next(iter(made)): file}, despite_verdict=True).notes)
-    assert "arm.csv: with the calibration's joint values q its joint 3 is at -1 q2 +1 q3" in notes
+    assert "arm.csv: for joint values q of the calibration, its joint 3 is at -1 q2 +1 q3" in notes
     assert "arm.csv lacks base and tool: base x 0.000" in notes
     q = configurations(6)
     read = read_arm(file, convention="modified" if "robodk" in made else "").robot

@@ -49,7 +49,7 @@ def test_what_the_standard_asks_for_is_said_where_it_is_not_there() -> None:
     assert whole.content()["notes"] == []
     few = ro.use.iso9283(poses[:62], rng.normal(size=(62, 3)))
     assert few.content()["notes"] == [
-        "The standard requires 5 poses, 30 approaches each: the table has 3 poses, the least with 2 approaches.",
+        "The standard requires 5 poses, 30 approaches each: the table has 3 poses, with at least 2 approaches each.",
         "No commanded poses are known: repeatability is computed, accuracy is not.",
     ]
     assert few.accuracy is None

@@ -154,7 +154,7 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
     interior = bool(low + 0.1 < best < high - 0.1)
     note = "corner of the L-curve by golden-section search"
     if not interior:
-        note = "the search ended at an edge: the L-curve has no corner"
+        note = "the search ended at an edge: the L-curve has no corner; another selector may be better"
     note += skipped(len(seen) - len(order))
     return Selection(float(np.exp(best)), "corner", np.exp(order), menger(points), interior, note)
 

@@ -79,7 +79,7 @@ Selector = Callable[[Program], Selection | float]
 
 
 def on_inliers(rule: Callable[..., Selection]) -> Callable[..., Selection]:
-    """Apply a rule to the equivalent linear estimator of a robust fit, repeated until its choice stays."""
+    """Apply a rule to the equivalent linear estimator of a robust fit, until its choice no longer changes."""
 
     @wraps(rule)
     def chosen(program: Program, *arguments: Any, **options: Any) -> Selection:

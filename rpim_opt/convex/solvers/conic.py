@@ -168,7 +168,7 @@ class Canonical:
 
     @cached_property
     def clarabel_cones(self) -> list[Any]:
-        """The cones as Clarabel has them."""
+        """The cones in Clarabel's form."""
         if self.cones is not None:
             return list(self.cones)
         clarabel = import_module("clarabel")

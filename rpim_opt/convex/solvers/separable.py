@@ -111,7 +111,7 @@ class Rows:
         return self.A[places], self.b[places]
 
     def program(self, loss: Loss, which: np.ndarray, canonical: Canonical, squares: int) -> ReducedProgram:
-        """Return the small program with some entries of a loss as they are, beside so many rows of squares."""
+        """Return the reduced program with some entries of a loss unchanged, and a number of rows of squares."""
         counts = None if self.counts is None else self.counts[which]
         return ReducedProgram(canonical, squares, loss.some(which), counts)
 

@@ -42,7 +42,7 @@ class WarmStart:
         return self.structure.canonical
 
     def program(self, rows: int, loss: Canonical | None = None, counts: np.ndarray | None = None) -> ReducedProgram:
-        """Return the small program with so many rows of squares, and with all rows of a loss."""
+        """Return the reduced program with a number of rows of squares, and with all rows of a loss."""
         key = rows, loss is None
         if key not in self.small:
             self.small[key] = ReducedProgram(self.canonical, rows, loss, counts)

@@ -114,7 +114,7 @@ class Measurement(Brief):
         return f"'{self.name}': {', '.join(self.components)}"
 
     def stands_in(self, stems: AbstractSet[str]) -> bool:
-        """Whether a table has its columns, in any of its forms, and of two points those of the second (``to_...``)."""
+        """Whether a table has its columns in any form; for two points, also one of the second (``to_...``)."""
         forms = [self.columns, *(form for form, _ in self.forms)]
         second = self.points < 2 or any(stem.startswith("to_") for stem in stems)
         return second and any(set(form) <= stems for form in forms)

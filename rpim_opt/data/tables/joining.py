@@ -54,7 +54,7 @@ SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 
 
 class Key(NamedTuple):
-    """What names rows on both sides: in words, its columns, and the keys of the rows with joints and measured ones."""
+    """Key that joins two tables: its name, its columns, and its values in the rows of joints and of measured values."""
 
     how: str
     columns: tuple[str, ...]
@@ -75,7 +75,7 @@ class Match(NamedTuple):
 def together(
     tables: Sequence[CanonicalTable], robot: Robot, kind: Measurement, key: str = "", within: float | None = None
 ) -> CanonicalTable:
-    """Return tables stacked where each is whole, else joined; ``key`` and ``within`` as in `TableOptions`."""
+    """Return tables stacked if each is complete, else joined; ``key`` and ``within`` as in `TableOptions`."""
     stems = row_stems(robot, kind)
     moving = [table for table in tables if table.stems & stems["joint"]]
     seen = [table for table in tables if table.stems & stems["measured"]]
@@ -348,7 +348,7 @@ def _by_time(joints: CanonicalTable, values: CanonicalTable, key: str, within: f
     left, right, apart = left[order], right[order], apart[order]
     if not len(left):
         nearest = float(np.abs(there - then[0]).min())
-        found = f"no two within {within:g} s; the first measured row is {nearest:.6g} s from one with joints"
+        found = f"none within {within:g} s of each other; the first measured row is {nearest:.6g} s from any joint row"
         raise InputError("times", found, "synchronized clocks, or a larger --time-tolerance")
     labels = values.labels
     notes = [
@@ -387,8 +387,8 @@ def _clocks(joints: CanonicalTable, times: Array, moments: Array) -> str:
     runs = np.split(good, np.flatnonzero(np.diff(good) > 1) + 1)
     nearest = OFFSETS[min(runs, key=lambda run: np.abs(OFFSETS[run]).min())]
     return (
-        f"It stands still if {nearest.mean():+.2g} s ({nearest[0]:+.2f} to {nearest[-1]:+.2f}) are added to the times "
-        "of the measured rows: add the clocks' offset to that column."
+        f"The robot is at rest if {nearest.mean():+.2g} s ({nearest[0]:+.2f} to {nearest[-1]:+.2f}) are added to the "
+        "times of the measured rows: add this clock offset to that column."
     )
 
 

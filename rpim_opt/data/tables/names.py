@@ -123,7 +123,7 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Meaning:
     for part in named:
         number, why = UR_NUMBERS.get(part, 0), "a joint of Universal Robots"
         if part in joints:
-            number, why = joints.index(part) + 1, "a joint of the robot's file"
+            number, why = joints.index(part) + 1, "a joint of the robot file"
         if number:
             return Meaning(f"tau{number}" if path[-1] == "effort" else f"q{number}", "", why, kind)
     for pattern, meaning, *reason in NAMES:

@@ -105,7 +105,7 @@ def interpret(
 ) -> CanonicalTable:
     """Interpret a raw table with the names that `read_data` takes, leaving out other columns and rows without values.
 
-    ``joints`` are the names of the robot's file. Of ``targets`` what was commanded counts; rows may lack either values.
+    ``joints`` are the names of the robot file. Of ``targets`` what was commanded counts; rows may lack either values.
     """
     units = options.units
     raw = _readings_below_each_other(raw)
@@ -295,7 +295,7 @@ def _read(name: str, group: str, known: Sequence[str], names: Sequence[str], joi
     unit = unit or of_group
     for whole in (text, stem):
         if whole in joints:
-            return Meaning(f"q{joints.index(whole) + 1}", unit, "a joint of the robot's file")
+            return Meaning(f"q{joints.index(whole) + 1}", unit, "a joint of the robot file")
     if stem in known:
         return Meaning(stem, unit, "by its name")
     if stem.lower() in names:  # elsewhere such a column holds labels
@@ -487,7 +487,7 @@ def _under_our_names(
         if unit and UNITS[unit].dimension not in dimensions[stem]:
             accepted = f"one of {' or '.join(dimensions[stem]) or 'no unit'} (in the header or the row below it)"
             if re.fullmatch(r"q\d+", stem):
-                accepted += ', or another type of the joint in the robot\'s file (type = "prismatic")'
+                accepted += ', or another type of the joint in the robot file (type = "prismatic")'
             raise InputError("the header", f"column '{name}' ({meaning(stem)}) in {unit}", accepted)
         new = f"{stem}_{unit}" if unit else stem
         if new in columns:

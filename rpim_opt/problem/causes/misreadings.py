@@ -248,10 +248,10 @@ def _of_positions(points: Points) -> Iterator[Misreading]:
     for factor, (unit, remedy) in LENGTHS.items():
         if wrong_robot and "thousand" in unit:
             robot = replace(points.robot, mdh=points.robot.mdh / [1, factor, 1, factor, 1])
-            remedy = f"correct the unit of the robot's file; or {remedy}, if their unit is wrong"
+            remedy = f"correct the unit of the robot file; or {remedy}, if their unit is wrong"
             yield _with_robot(f"robot lengths {LENGTHS[1 / factor][0]}", remedy, robot)
         else:
-            remedy += "; or correct the robot's file, if its unit is wrong"
+            remedy += "; or correct the robot file, if its unit is wrong"
             yield _scaled(f"measured lengths {unit}", remedy, factor)
         for axis, of_axis in zip("xyz", np.eye(3), strict=True):
             remedy = f"multiply column {axis} by {factor:g} or name its unit"
@@ -588,7 +588,7 @@ def _of_mapping(mapping: JointMapping) -> Better:
         words = f"{MIRRORED.what}, or {words}"
         remedy = (
             f"change the sign of one coordinate (or exchange two), or {remedy}; a known direction in the "
-            "instrument's frame, up for instance, tells which"
+            "instrument's frame (such as up) shows which"
         )
     return Better(words, remedy, mapping.nominal, mapping.left)
 

@@ -216,7 +216,7 @@ def _values_that_fit(points: Points, joint: int, known: Fit | None = None) -> Ar
 
 
 def better_interpretations(problem: CalibrationProblem, most: float = np.inf) -> list[str]:
-    """Return what explains a table better than it is stated: another place or interpretation of some rows, or of all.
+    """Return better explanations of a table: other frames or another interpretation of some rows, or of all.
 
     Where half of the rows agree with the nominal robot, another interpretation is sought of the others first. One of
     all rows leaves errors of at most ``most`` [m] by the nominal robot, or a robot's part of the points' extent.
@@ -259,7 +259,7 @@ def other_places(problem: CalibrationProblem) -> Iterator[str]:
 
 
 def computed_rows(problem: CalibrationProblem) -> Iterator[str]:
-    """Report rows, of those that fit no others, that agree with the nominal robot more exactly than is measured."""
+    """Report rows that fit no others and agree with the nominal robot more closely than any measurement."""
     points = points_of(problem) or lengths_of(problem)
     if points is None or points.by_camera or len(points.row) < FEWEST:
         return

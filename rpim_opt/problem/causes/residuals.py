@@ -195,7 +195,7 @@ def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[st
 
 
 def wrong_gear_ratio(problem: CalibrationProblem, x: Array, most: float) -> Iterator[str]:
-    """Say which gear ratio or coupling leaves at most a part of the squares at x (n,) where its slope says too little.
+    """Report a gear ratio or coupling, too large for a linearization, that reduces the squares at x (n,) to a part.
 
     All is fitted anew with it: of a ratio 3 % off a joint is 50 mrad off at its ends.
     """
@@ -446,7 +446,7 @@ def _two_kinds(problem: CalibrationProblem, x: Array) -> tuple[np.ndarray, float
 
 
 def another_robot(problem: CalibrationProblem, identified: Robot) -> Iterator[str]:
-    """Report rows that by themselves are of a robot of the type, but of the identified one in no base."""
+    """Report rows that fit a robot of this type, but not the identified robot, whatever its base and reflector."""
     points = points_of(replace(problem, robots=identified))
     if points is None or points.by_camera or len(points.row) < FEWEST:
         return
@@ -458,7 +458,7 @@ def another_robot(problem: CalibrationProblem, identified: Robot) -> Iterator[st
     if fits and rms(z[~free.of_frames]) < NOISY and placed > NOISY * own:
         yield (
             f"{named_rows(problem.data, points.row, 'fits', 'fit')} the nominal robot with deviations of their own "
-            f"({three_digits(1e3 * own)} mm RMS), the robot of the others in no base and with no reflector "
+            f"({three_digits(1e3 * own)} mm RMS), but not the robot of the others, whatever the base and reflector "
             f"({three_digits(1e3 * placed)} mm): were they measured at another robot of this type, or did several "
             "joints change? Calibrate the two groups separately, or leave one out ([exclude])."
         )
@@ -711,7 +711,7 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
             part = sign[i] * factor * sign[j]
             what = f"joint {one} is coupled to joint {other} (q{i + 1} {part:+.4f} q{j + 1})"
             if abs(part) < COUPLED:
-                return what, "no gears have so small a ratio: have bearings, hoses and mounting of both joints checked"
+                return what, "no gear has so small a ratio: check bearings, hoses and mounting of both joints"
         return what, coupling(joint_map(i, j, coefficients))
 
     for i, j in product(of_zero, range(q.shape[1])):

@@ -101,7 +101,7 @@ def all_q(data: Dataset) -> Array:
 
 
 def named_rows(data: Dataset, rows: np.ndarray, of_one: str, of_several: str, most: int = 8) -> str:
-    """Name rows, the first so many, before their verb."""
+    """Return the names of the first rows, and the verb that follows."""
     labels = [data.label[i] for i in rows]
     if len(labels) == 1:
         return f"row {labels[0]} {of_one}"
@@ -254,7 +254,7 @@ def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Itera
 
 
 class Rounding(NamedTuple):
-    """What is rounded, the RMS error which that makes [m], and what helps.
+    """What is rounded, the RMS error that this causes [m], and the remedy.
 
     Residuals are at least a part ``least`` of it; ``step`` is what every joint is rounded to, empty if not all are.
     """
@@ -280,7 +280,7 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
 
 
 def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterator[str]:
-    """Report rounding of joint or measured values, if the RMS error [m] of a fit is less than so many times its own."""
+    """Report rounding of joint or measured values if the RMS error [m] of a fit is below ``most`` times its own."""
     for each in every_rounding(problem):
         if each.least * each.made < error < most * each.made:
             yield (
@@ -290,7 +290,7 @@ def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterato
 
 
 def every_rounding(problem: CalibrationProblem) -> Iterator[Rounding]:
-    """Yield roundings of joint and measured values that are there, whatever they explain."""
+    """Yield all roundings of joint and measured values, whether or not they explain a fit."""
     q, turning = all_q(problem.data), np.array(problem.robot.joint_dimensions) == "angle"
     slopes = problem.joint_slopes(sliding=True)[Equations.of(problem.data).length] @ problem.robot.joint_map
     levers = np.sqrt(np.sum(slopes**2, axis=0) / len(problem.data))  # how far a joint moves a point [m/rad, m/m]

@@ -56,7 +56,7 @@ MOST_JOINTS = 8  # joints beyond which signs are too many to be tried
 SAME_TOOL = 0.05  # distances of a reflector from its stated place [m] whose multiples distinguish two descriptions
 MIRRORED = 1.3  # a left-handed frame fits as well if it leaves up to so many times what a mapping leaves
 COMPARED = 200  # configurations at which mappings are compared
-WRITE = "write sign, and add the zeros to theta_deg (or theta_rad), of these joints in robot.toml"  # the remedy
+WRITE = "write these joints' sign in robot.toml and add their zeros to theta_deg (or theta_rad)"  # the remedy
 AS_STATED = "joints as stated"
 TOLD = 2  # other mappings of equal fit that are named, the best ones
 RARE_BASIN = 0.005  # probability of reaching a basin with one start whose probability of being missed is reported
@@ -145,7 +145,7 @@ class JointMapping:
                 first = described(self, self.sign, self.zero)
                 sentences.append(
                     f"The data fit {what} as well as {first}: lengths do not distinguish an arm from its mirror "
-                    f"image. Measure a few positions to decide, or {WRITE}, as the set-up confirms."
+                    f"image. Measure a few positions to decide, or check the set-up, and {WRITE}."
                 )
                 continue
             values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.deciding, strict=True))

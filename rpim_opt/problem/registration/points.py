@@ -59,7 +59,7 @@ class Points:
         )
 
     def evenly(self, most: int) -> Points:
-        """Return at most so many of the points, evenly spread."""
+        """Return at most ``most`` of the points, evenly spread."""
         return self.take(np.linspace(0, len(self.row) - 1, min(most, len(self.row))).round().astype(int))
 
     @property
@@ -165,7 +165,7 @@ class Candidates(NamedTuple):
 
     @classmethod
     def of(cls, tries: Sequence[Points]) -> Candidates:
-        """Return candidates of one robot and as many points each, joint zeros and reflectors as they are stated.
+        """Return candidates of one robot with equal numbers of points, and stated joint zeros and reflectors.
 
         Of poses the tips of their axes are points of further reflectors.
         """
@@ -214,7 +214,7 @@ def fit_arms(
 
 
 def stacked(fits: Sequence[Fit]) -> Fit:
-    """Return fits of sets of as many points one after the other."""
+    """Return the concatenation of fits with equal numbers of points."""
     return Fit(*(np.concatenate(each) for each in zip(*fits, strict=True)))
 
 

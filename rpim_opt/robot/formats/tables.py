@@ -401,7 +401,7 @@ def rounded(robot: Robot) -> Robot:
 
 
 def joints_alone(robot: Robot, file: Path) -> tuple[Robot, list[str]]:
-    """Return the robot with joints that turn by their own values, and a sentence on how the controller counts those."""
+    """Return the robot without joint map and limits, and a sentence on how the controller counts its joints."""
     alone = replace(robot, joint_map=np.empty((0, 0)), limits=np.empty((0, 0)))
     return alone, joint_values(robot, alone, file)
 

@@ -119,7 +119,7 @@ def branching_tip(path: Path, base: str | None, tip: str | None) -> str:
 
 @of_file
 def remembered_ends(path: str | Path, robot: Robot) -> tuple[str | None, str | None]:
-    """Return the links of a file between which a robot is, by its source as from `read_urdf`; otherwise None twice."""
+    """Return base and tip link of a robot, by its source as from `read_urdf`; None for both if of another file."""
     ends = re.fullmatch(r".*, (.+) to (.+)", robot.source)
     return (ends[1], ends[2]) if ends and set(ends.groups()) <= set(_read(Path(path)).links) else (None, None)
 
@@ -452,7 +452,7 @@ class _Urdf:
         return joints
 
     def followed(self, joint: _Joint) -> tuple[str, float, float]:
-        """Return the joint that moves on its own and by which one moves: its name, and multiplier and offset."""
+        """Return the independent joint that a joint follows: its name, and multiplier and offset."""
         factor, offset = 1.0, 0.0
         seen = [joint]
         while (mimic := seen[-1].mimic) is not None:

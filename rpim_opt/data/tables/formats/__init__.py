@@ -1,1 +1,1 @@
-"""Table formats beside plain tables, one file each."""
+"""Table formats other than plain tables, one module each."""

@@ -61,7 +61,7 @@ def _paired(name: str, fields: str) -> Target:
 
 
 def read_joints(pattern: re.Pattern[str], text: str) -> Rows:
-    """Return the points of joint values, each as a pattern of its name and its values has them."""
+    """Return points with joint values, from a pattern whose groups are the name and the values."""
     return _rows([_listed(name, cells) for name, cells in pattern.findall(text)])
 
 

@@ -36,14 +36,14 @@ def read(text: str) -> Rows:
 
 
 def read_yaml(text: str) -> Rows:
-    """Return the rows of a YAML text without aliases, which grow beyond memory."""
+    """Return the rows of a YAML text; refuse aliases, which may expand beyond memory."""
     yaml = library("yaml", "YAML files")
     try:
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
             raise InputError("the YAML text", "an alias (*)", "values written out")
         documents = [document for document in yaml.safe_load_all(text) if document is not None]
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise InputError("the YAML text", " ".join(str(error).split())[:200], "a whole YAML file") from None
+        raise InputError("the YAML text", " ".join(str(error).split())[:200], "a complete YAML file") from None
     return _rows(documents[0] if len(documents) == 1 else documents)
 
 
