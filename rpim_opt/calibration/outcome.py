@@ -115,7 +115,7 @@ class Outcome:
 
     @cached_property
     def contradiction(self) -> str:
-        """A sentence on constraints that the data contradict; empty if there are none, or no quadratic model.
+        """Sentence on constraints that data contradict; empty if there are none, or the loss has no quadratic model.
 
         Without constraints the sum of squares falls by chi-square of as many degrees of freedom as are active, if they
         hold for the robot, times the residuals' variance where that is larger than the noise. Of a robust loss they

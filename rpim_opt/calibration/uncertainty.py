@@ -215,7 +215,7 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
 
 
 def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None = None) -> HeldOut:
-    """Return the errors of a calibration on measurements that it did not use, beside their prediction intervals.
+    """Return the errors of a calibration on measurements that it did not use, with their prediction intervals.
 
     Coverage and fit are those of the rows that are ``counted`` (N,), by default all. Where sessions stand apart, rows
     of one that was not measured have no interval. The fit is by the joint prediction of r, with the covariances V of

@@ -184,7 +184,7 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
 
 
 def underdetermined(result: Outcome) -> list[str]:
-    """Return a sentence on frames of which the data determine a combination alone."""
+    """Return a sentence on frame parameters of which the data determine only a combination."""
     p = result.problem.parameters
     covariance = result.known_covariance
     if covariance is None:

@@ -106,7 +106,7 @@ class Arguments(Identified):
 
 
 def whole(p: Arguments) -> Parameters:
-    """Return all parameters of the problem; of a table alone those that it has."""
+    """Return all parameters of the problem; without a problem, those of the arguments."""
     return p if p.problem is None else p.problem.parameters
 
 

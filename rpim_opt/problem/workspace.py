@@ -218,7 +218,7 @@ class Target(NamedTuple):
 
 
 def touched_place(problem: CalibrationProblem) -> Array:
-    """Return a point (3,) [m] in the base frame that the data's rows touched, near the middle of all such."""
+    """Return a point (3,) [m] in the base frame that the data's rows touched, the nearest to the mean of all."""
     centres = [thing.centre for thing in problem.touched]
     if not centres:
         raise InputError("the data", "no touch of a point", 'rows of measurement = "revisit"')

@@ -57,7 +57,7 @@ def error_rows(result: Calibration) -> list[dict[str, Any]]:
 
 
 def orientation_rows(result: Calibration) -> list[dict[str, Any]]:
-    """Return the same of orientations and of known angles [mrad]; empty where none were measured."""
+    """Return `error_rows` of orientations and of known angles [mrad]; empty if none were measured."""
     rows: list[dict[str, Any]] = []
     for name, data in sets(result).items():
         rows += _both_models(result, name, data, "angle", unit="mrad")
@@ -144,7 +144,7 @@ def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None
 
 
 def conclusion(result: Calibration, found: Workspace | None) -> tuple[str, str]:
-    """Return the verdict on a robot without an acceptance limit, and it as a sentence; empty if it is not delivered."""
+    """Return the verdict on a robot without an acceptance limit, and a sentence on it; empty if it is not delivered."""
     if not result.verdict.delivered:
         return "rejected", ""
     if doubt := inconclusive(result, found):

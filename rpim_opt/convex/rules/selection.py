@@ -160,7 +160,7 @@ def with_rows(program: Program, name: str) -> LinearModel:
 
 
 def require_weight(weight: float, where: str, file: object = None) -> float:
-    """Return a weight whose square and inverse are numbers, too; or refuse it."""
+    """Return a weight; refuse one that is negative, or whose square or inverse is no number."""
     if not (np.isfinite(weight) and (weight == 0 or SMALLEST <= weight <= LARGEST)):
         accepted = f"a finite number, zero or more ({SMALLEST:g} to {LARGEST:g})"
         raise InputError(where, f"'{weight}'", accepted, file)

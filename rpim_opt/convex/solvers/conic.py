@@ -143,7 +143,7 @@ class Canonical:
 
     @property
     def polyhedral(self) -> bool:
-        """Whether an active set may solve it: equations and inequalities alone, without variables of functions' own."""
+        """Whether an active set may solve it: few linear equations and inequalities, no variables of the functions."""
         return self.linear == len(self.b) and not self.own and len(self.b) * self.size <= DENSE
 
     @property

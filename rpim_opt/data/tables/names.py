@@ -156,7 +156,7 @@ ROUNDED = 1e-6  # the last row of a matrix is 0 0 0 1 within this
 
 
 def numbered(read: Meanings, table: Columns, dof: int, order: str) -> None:
-    """Name the numbered columns of quaternions and matrices; if an order is stated, others of a quaternion, too."""
+    """Name the numbered columns of quaternions and matrices; with a stated order, also other quaternion columns."""
     order, of_all = order.removeprefix(NUMBERED), order in ORDERS
     if order not in ("", *ORDERS):
         raise InputError("--quaternion", f"'{order}'", " or ".join(ORDERS))

@@ -78,14 +78,14 @@ def hardly_moved(robot: Robot, measured: Array) -> list[str]:
 
 
 def moved_one_by_one(robot: Robot, q: Array) -> bool:
-    """Return whether nearly all joint values (N, dof) differ from a common configuration in one joint alone."""
+    """Return whether nearly all joint values (N, dof) differ from a common configuration in at most one joint."""
     near = np.array([LEAST_TRAVEL[robot.joint_types[i]] / 10 for i in robot.leading])
     away = np.abs(q - np.median(q, axis=0)) > near
     return robot.dof > 1 and bool(np.mean(away.sum(axis=1) <= 1) > ONE_BY_ONE)
 
 
 def beyond_limits(robot: Robot, q: Array, by: float = 0.0) -> Iterator[str]:
-    """Say which joint values (N, dof) leave the joint's limits, ``by`` that many times their range."""
+    """Report joints whose values (N, dof) exceed their limits by more than ``by`` times their range."""
     for i, dimension in enumerate(robot.joint_dimensions):
         low, high = robot.limits[i]
         least, largest = q[:, i].min(), q[:, i].max()

@@ -74,7 +74,7 @@ class Points:
 
 
 def of_sessions(problem: CalibrationProblem) -> list[CalibrationProblem]:
-    """Return the parts of a problem whose sessions are registered one by one, the largest first; else it alone."""
+    """Return the parts of a problem whose sessions are registered one by one, the largest first; else the problem."""
     session, free = problem.data.session, problem.parameters.free.names
     if "base_x" in free or not any(map(of_session, free)):
         return [problem]
@@ -114,7 +114,7 @@ def points_of(problem: CalibrationProblem) -> Points | None:
 
 
 def lengths_of(problem: CalibrationProblem) -> Points | None:
-    """Return the lengths of a cable or of distances, all by the same reflectors and anchor; None for others, or few."""
+    """Return lengths of a cable or of distances, all by the same reflectors and anchor; None for other or few data."""
     blocks = problem.data.blocks
     kinds = {(block.measurement.name, block.markers, block.fixture) for block in blocks}
     if len(kinds) > 1 or blocks[0].measurement.name not in ("cable", "distance") or len(problem.arms) > 1:

@@ -352,7 +352,7 @@ class _Joint:
         return self.edits(data, "origin", {name: text for name, text in texts if text is not None})
 
     def edits(self, data: bytes, tag: str, new: dict[str, str]) -> dict[tuple[int, int], str]:
-        """Return what to replace in the file so that an element has these attributes; it is put in where it is not."""
+        """Return what to replace in the file so that an element has these attributes; a missing element is added."""
         element = self._only(tag)
         start = self.element.start if element is None else element.start
         end = next(TAG.finditer(data, start)).end()
