@@ -437,7 +437,7 @@ def _rows_apart(result: Calibration, data: Dataset | None) -> tuple[Dataset, Hel
             apart = apart.without(used) if used else apart
             held = held_out_errors(result, apart)
             mistake, remark = displacement(result, apart, held)
-            return apart, held, [], f"{mistake} `validate` names the likelier cause." if mistake else remark
+            return apart, held, [], f"{mistake} `validate` compares the two causes." if mistake else remark
         if held is not None and not set(held.label).issuperset(used.values()):
             return None
     if held is None:
