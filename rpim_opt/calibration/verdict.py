@@ -88,12 +88,13 @@ MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), 
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
 UNUSUAL = {"length": 0.004, "angle": 0.05}
 """Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
-SCALED, BY_CHANCE, STATED = 0.001, 0.005, 3
+SCALED, BY_CHANCE, STATED = 0.001, 0.005, 6
 """Common deviation of the longest link [m] from which a wrong scale is the likelier reason, and its probability: F test
 against the other deviations of lengths, and their stated scale as so many more."""
 UNSCALED, SIGMAS = 0.005, 3.0  # that from which on no machined robot has it, also in stated standard deviations
 MOST_SCALED = 0.3  # beyond that no scale is off, but a unit
-LENGTHS = 3  # identified ones below which a common deviation is no more than that of each
+LENGTHS, PRIORS = 2, 0.75
+"""Identified lengths from which on a common deviation is more than that of each; part of one that a prior decides."""
 ALIKE = 0.045  # part of an effect on the data that others may leave where these do not distinguish them
 DEPENDENT = 1e-6  # singular value of effects, over the largest, below which they are combinations of the others
 TAKES_PART = 0.1  # part of the largest share in an effect from which on a frame parameter is named
@@ -265,7 +266,9 @@ def _stretch(result: Outcome) -> tuple[float, float]:
     # of rows that do not fit, and of another robot, deviations say nothing
     if C is None or any(_residuals(result)) or any(_deviations(result)):
         return 0.0, 0.0
-    lengths = (np.array(free.dimensions) == "length") & ~free.of_frames & (free.nominal != 0) & np.isfinite(np.diag(C))
+    lengths = (np.array(free.dimensions) == "length") & ~free.of_frames & (free.nominal != 0)
+    fit = result.fit_covariance  # lengths that the prior alone determines are near their nominal values
+    lengths &= np.isfinite(np.diag(C)) & (fit.weight * np.diag(fit.form.prior(fit.weight)) < PRIORS)
     if lengths.sum() < LENGTHS:
         return 0.0, 0.0
     nominal, x = free.nominal[lengths], result.x[lengths]

@@ -6,10 +6,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import combinations
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from scipy.special import logsumexp
 
 from rpim_opt.basics.arrays import TINY, Array, rms, statistics
 from rpim_opt.basics.exceptions import InputError
@@ -68,7 +68,7 @@ class Cause(NamedTuple):
     """A change that may explain the deviation of readings from their predictions."""
 
     name: str
-    kind: str  # joint offset, parameter, frame, transmission error, reading
+    kind: str  # joint offset or offsets, parameter, link, frame, transmission error, reading
     members: tuple[str, ...]  # parameters, or rows
     gain: float = 0.0  # by which chi-squared falls
     p_value: float = 1.0  # of that where nothing changed
@@ -719,8 +719,9 @@ class Misfit:
 def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -> list[Cause]:
     """Return the candidate changes: parameters, whole frames and whole transmission errors that were not reset.
 
-    A motor that moves several joints shifts all their zeros, and a plate moves all its reflectors. A link that is
-    ``bent`` changes all six numbers between its joints, which explain most of what moves a frame.
+    A motor that moves several joints shifts all their zeros, and a plate moves all its reflectors. With ``bent`` two
+    joint zeros at once are candidates, and links: all six numbers between two joints, which explain most of what moves
+    a frame.
     """
     free, place = problem.parameters.free, registration(problem.parameters.free, problem.sample().data)
     causes = []
@@ -743,7 +744,7 @@ def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -
 
 
 def _of_arms(problem: Source, bent: bool) -> Iterator[Cause]:
-    """Yield motors that move several joints, and links that are bent, by the identified numbers between two joints."""
+    """Yield motors that move several joints; if bent, two joint zeros, and the numbers between two joints."""
     names = problem.parameters.free.names
     for which, arm in problem.arms.items():
         zeros = [("d" if kind == "prismatic" else "theta") + str(i) for i, kind in enumerate(arm.joint_types, 1)]
@@ -751,6 +752,9 @@ def _of_arms(problem: Source, bent: bool) -> Iterator[Cause]:
             moved = [problem.parameters.called(which, zeros[k]) for k in np.flatnonzero(column)]
             if len(moved) > 1:
                 yield Cause(f"motor {arm.joint(motor)} ({joined(moved)})", "joint offset", tuple(moved))
+        free = [name for name in (problem.parameters.called(which, zero) for zero in zeros) if name in names]
+        for pair in [*combinations(free, 2)] * bent:  # of several motors that were exchanged, two
+            yield Cause(joined(pair), "joint offsets", pair)
         for i in range(1, len(arm.mdh) * bent):
             own = [f"theta{i}", f"d{i}", f"beta{i}", *(f"{kind}{i + 1}" for kind in ("alpha", "a", "theta", "d"))]
             members = [name for name in (problem.parameters.called(which, each) for each in own) if name in names]
@@ -805,9 +809,9 @@ def log_bayes_factor(g: Array, G: Array, width: Array) -> float:
 
         ln p(y | d ~ N(0, W^2)) / p(y | 0) = (g' (G + W^-2)^-1 g - ln det(I + W G W)) / 2
     """
-    logs = []
-    for W in [multiple * width for multiple in MULTIPLES]:
-        inner = np.eye(len(g)) + W[:, None] * G * W
-        squares = (W * g) @ np.linalg.solve(inner, W * g)
-        logs.append(0.5 * (squares - np.linalg.slogdet(inner)[1]))
-    return float(logsumexp(logs) - np.log(len(MULTIPLES)))
+    W = np.outer(MULTIPLES, width)
+    inner = np.eye(len(g)) + W[:, :, None] * G * W[:, None, :]
+    along = W * g
+    squares = np.sum(along * np.linalg.solve(inner, along[:, :, None])[:, :, 0], axis=1)
+    logs = (squares - np.linalg.slogdet(inner)[1]) / 2
+    return float(np.logaddexp.reduce(logs) - np.log(len(MULTIPLES)))

@@ -515,13 +515,17 @@ def test_an_external_axis_is_the_joint_that_slides(tmp_path: Path) -> None:
         ["1", "3"],
         ["2", "4"],
     ]
-    program = "DECL E6AXIS XP1={A1 1.5,A2 -2,E1 2366.4,E2 0.0}\nDECL E6AXIS XP2={A1 3.5,A2 -4,E1 120,E2 0.0}\n"
-    joints = read(write(tmp_path, program, "raw.dat"), robot=arm)
-    assert [joints.columns[name] for name in ("label", "q1_mm", "q3_deg")] == [
-        ["P1", "P2"],
-        ["2366.4", "120"],
-        ["-2", "-4"],
-    ]
+    programs = {
+        "raw.dat": "DECL E6AXIS XP1={A1 1.5,A2 -2,E1 2366.4,E2 0.0}\nDECL E6AXIS XP2={A1 3.5,A2 -4,E1 120,E2 0.0}\n",
+        "raw.mod": "CONST jointtarget P1:=[[1.5,-2],[2366.4,9E+09]];\nCONST jointtarget P2:=[[3.5,-4],[120,9E9]];\n",
+    }
+    for name, program in programs.items():
+        joints = read(write(tmp_path, program, name), robot=arm)
+        assert [joints.columns[each] for each in ("label", "q1_mm", "q3_deg")] == [
+            ["P1", "P2"],
+            ["2366.4", "120"],
+            ["-2", "-4"],
+        ]
 
 
 def test_equal_rows_of_a_spreadsheet_are_as_many_as_they_were(tmp_path: Path) -> None:

@@ -185,7 +185,7 @@ def test_an_index_of_the_link_before_says_that_it_is_modified(tmp_path: Path, he
             "toolbox.py",
             "from math import pi  # RevoluteDH(d=1) was tried first\nrobot = DHRobot([\n"
             "    RevoluteDH(d=0.4, a=0.025, alpha=-pi/2), RevoluteDH(a=0.455),\n"
-            "    RevoluteDH(a=0.035, alpha=-np.pi / 2, offset=-pi/2, qlim=[-pi, pi]),\n"
+            "    RevoluteDH(a=0.035, alpha=-np.pi / 2, offset=np.deg2rad(-90), qlim=[-pi, pi]),\n"
             "    DHLink(d=0.42, alpha=pi/2), RevoluteDH(alpha=-pi/2), RevoluteDH(d=0.08)], name='KR 6')\n",
         ),
     ],

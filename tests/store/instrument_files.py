@@ -289,6 +289,11 @@ INSTRUMENTS: dict[str, Shape] = {
         text([["Name", *joint_names("JT{} [deg]"), "X [mm]", "Y [mm]", "Z [mm]", "O [deg]", "A [deg]", "T [deg]"]],
              beside(ROWS, OAT)), kind="pose",
     ),
+    "OpenCV's tvec and rvec": one(
+        text([["image", *joint_names("q{}"), "tvec_x", "tvec_y", "tvec_z", "rvec_x", "rvec_y", "rvec_z"]],
+             beside(NAMED, RADIANS, METRES, cells(Rotation.from_matrix(T[:, :3, :3]).as_rotvec()))),
+        kind="pose", units="rad,m",
+    ),
     "Vicon CSV beside a table of joints": many(
         ("joints.csv", text([["Frame", *HEAD[1:7]]], [[str(i + 1), *q] for i, q in enumerate(JOINTS)])),
         ("vicon.csv", vicon()),

@@ -184,6 +184,16 @@ def test_a_link_that_was_bent_is_one_change() -> None:
     assert (drift.cause.name, drift.first) == ("link between joints 3 and 4", 0)
 
 
+def test_two_motors_that_were_exchanged_at_once_are_no_bent_link() -> None:
+    """Their zeros are two of the six numbers of the link between them."""
+    robot = happened(6, theta3=1.3e-3, theta4=-9e-4)
+    first = ro.calibrate(robot.problem.on(robot.before))
+    drift = ro.use.monitor(first, robot.after).drift
+    assert drift is not None
+    assert str(drift.cause) == "joint offsets theta3 and theta4"
+    assert [cause.name for cause in ro.use.update(first, robot.after).changes] == ["theta3", "theta4"]
+
+
 def test_what_an_update_does_not_explain_is_not_delivered_by_its_file_either(tmp_path) -> None:
     """Two links were bent: the sentence was printed, and the file exported and compensated."""
     bent = {"alpha3": 3e-3, "a3": 8e-4, "theta2": 4e-3, "alpha5": -4e-3, "a5": -6e-4, "d5": 7e-4, "theta4": 3e-3}

@@ -31,7 +31,9 @@ class Meaning(NamedTuple):
 Meanings = dict[str, Meaning]  # what every column holds, by its name
 
 
-_WHERE = r"(?:(?:field|pose|transform|point|position|translation|pos|p|t|coords?|coordinates?|cartesian|cart|tcp)_?)*"
+_WHERE = (
+    r"(?:(?:field|pose|transform|point|position|translation|pos|p|t|tvec|coords?|coordinates?|cartesian|cart|tcp)_?)*"
+)
 _JOINT = "q|j|jt|joint|axis|ax|a|theta|θ|rax|achse|gelenk|axe|eje|giunto|关节|轴|軸"
 _SPREAD = r"(?:std|stdev|stddev|std_?dev|sigma|sd)"
 NAMES: tuple[tuple[str, ...], ...] = (
@@ -70,6 +72,7 @@ NAMES: tuple[tuple[str, ...], ...] = (
 """What else a column may be called, in lower case and with underscores, what it means, and why unless that is usual."""
 IN_SI = {
     r"%?field\..*|/.*|(?:pose|transform)\.\w+\.\w|position\[\d\]": "ROS: SI units (REP 103)",
+    r"rvec_[xyz]": "OpenCV: radians",
     r"(?:actual|target)_(?:q|TCP_pose)_\d": "Universal Robots' RTDE: SI units",
 }
 """Patterns of names whose units are rad and m, and whose they are."""
@@ -88,8 +91,9 @@ TURNS = (
     (("a", "b", "c"), ("rz", "ry", "rx"), "KUKA: A, B, C turn about z, y, x", ""),
     (("w", "p", "r"), ("rx", "ry", "rz"), "FANUC: W, P, R turn about x, y, z", ""),
     (("o", "a", "t"), ("rx", "ry", "rz"), "Kawasaki: O, A, T", "intrinsic zyz"),
+    (("rvec_x", "rvec_y", "rvec_z"), ("rx", "ry", "rz"), "OpenCV: a rotation vector", "vector"),
 )
-"""Three letters that are angles where all of them are there, and the rotation unless that is roll, pitch, yaw."""
+"""Three names that are angles where all of them are there, and the rotation unless that is roll, pitch, yaw."""
 TCP = (("x", "y", "z", "rx", "ry", "rz"), "Universal Robots' RTDE: position and rotation vector", "vector")
 TCP_POSES = tuple((tuple(f"{which}_tcp_pose_{i}" for i in range(6)), *TCP) for which in ("target", "actual"))
 """The same of poses that a controller computes: targets, no measurements."""

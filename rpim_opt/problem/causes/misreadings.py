@@ -496,9 +496,12 @@ def _other_robots(points: Points) -> Iterator[Misreading]:
     standard = np.hstack([np.vstack([[0.0, 0.0], links[:-1]]), mdh[:, 2:]])
     convention = "a table in the {} Denavit-Hartenberg convention"
     distal, proximal = map(convention.format, ("standard (distal)", "modified (proximal)"))
+    exchanged = mdh.copy()  # whose a stand one row lower
+    exchanged[:, 1], exchanged[:, 3] = np.append(0.0, mdh[:-1, 3]), np.append(mdh[1:, 1], 0.0)
     tables = [
         (distal, "read it with --dh standard: alpha and a of every row belong to the next row", standard),
         ("columns a and d of the DH table exchanged", "exchange them", mdh[:, [0, 3, 2, 1, 4]]),
+        ("columns a and d of the standard DH table exchanged", "exchange them", exchanged),
         ("alpha of the other sign in the DH table", "change the signs of alpha", mdh * [-1, 1, 1, 1, 1]),
     ]
     for last in (0.0, QUARTER, -QUARTER):  # which the other convention gives to the tool
@@ -594,17 +597,28 @@ def _of_mapping(mapping: JointMapping) -> Better:
 
 
 def _mapping_behind(points: Points) -> Better | None:
-    """Return signs and zeros of joints behind a mirrored frame, or behind a unit that makes the points as wide."""
-    width = replace(points, y=forward_kinematics(points.robot, points.q)[:, :3, 3]).extent
+    """Return signs and zeros of joints behind a mirrored frame, a unit that makes points as wide, or a coupling."""
+    robot = points.robot
+    width = replace(points, y=forward_kinematics(robot, points.q)[:, :3, 3]).extent
     factor = min(LENGTHS, key=lambda each: abs(np.log(each * points.extent / width)))
     behind = [MIRRORED]
     if abs(np.log(factor * points.extent / width)) < abs(np.log(points.extent / width)):
         behind.append(_scaled(f"measured lengths {LENGTHS[factor][0]}", LENGTHS[factor][1], factor))
+    stated = robot.joint_map
+    apart = stated - np.eye(*stated.shape) * stated
+    maps = {"the coupling of the robot file with the opposite sign": [stated - 2 * apart]} if apart.any() else {}
+    if not maps and robot.leading[1:3] == (1, 2):  # FANUC's third joint counts from the horizontal
+        from_horizontal = np.outer(np.eye(robot.dof)[2], np.eye(robot.dof)[1])
+        what = f"joint {robot.joint(2)} coupled to joint {robot.joint(1)}"
+        maps[what] = [stated + from_horizontal, stated - from_horizontal]
+    behind += [_with_robot(what, "", replace(robot, joint_map=each)) for what, of in maps.items() for each in of]
     for each in behind:
-        mapping = search(each.change(points))
+        there = each.change(points)
+        mapping = search(there)
         if mapping is not None:
             found = _of_mapping(mapping)
-            return found._replace(what=f"{each.what} and {found.what}", remedy=f"{each.remedy}; {found.remedy}")
+            remedy = each.remedy or coupling(there.robot.joint_map * mapping.sign)
+            return found._replace(what=f"{each.what} and {found.what}", remedy=f"{remedy}; {found.remedy}")
     return None
 
 

@@ -47,6 +47,11 @@ NOISY = 3.0  # residual RMS over the stated noise above which the fit is not tha
 SEVERAL = 0.85  # several joint zeros moved, if that leaves less than this part of what one move leaves
 LOOSE = 4e-4  # backlash of a joint [rad, m] that no gear in order has: a quarter of that is usual
 COUPLED = 0.004  # ratio below which a coupling of two joints is not made by gears: teeth of one over those of another
+GEARS = {
+    "revolute": ("turns", "gear ratio"),
+    "prismatic": ("moves", "pitch of its screw or belt, or the scale of the instrument"),
+}
+"""What a joint does, and what its transmission is."""
 LOADS, SINGULAR = 0.6, 1e-9
 """What two loads leave of the residuals at most; part of the squares below which columns are the same."""
 TWO_KINDS, STARTS = 0.4, 30
@@ -55,6 +60,7 @@ SCATTERED = 5.0  # residuals of rows over those of the others from which on they
 FREE = 1.0  # [m, rad] standard deviation of where touched points and planes are
 NORMAL, HEAVY, LIKELIER = 1e3, 3.0, 7.0
 """Degrees of freedom of Student's distributions of all rows; log odds at which some are of another kind (1,000:1)."""
+STEADILY = "more and more from row to row"
 JUMPING = 0.5  # mean square step of every joint over that of rows in random order, above which rows have no order
 BENDS = 12  # degree of the polynomial that the side of a rail is
 COURSES = 6  # half waves that a slow motion has over all rows at most
@@ -365,7 +371,8 @@ def _changes(
         remedy = "Calibrate the two parts separately" + ", or name them in a column `session`" * (what == "base")
         if share.shape[1] > 1:  # motions of all points alike would be in the figure
             moved, remedy = "the points move to and fro", "Fix it, and measure again"
-        return f"{when} {moved}, consistent with a changed {what}", f"{cause}? {remedy}"
+        warm = "did it warm up, or " * (when == STEADILY)
+        return f"{when} {moved}, consistent with a changed {what}", f"{warm}{cause}? {remedy}"
 
     for when, part in by.items():
         share = part.reshape(len(A), -1)
@@ -381,7 +388,7 @@ def _shares(problem: CalibrationProblem, joint: int | None = None) -> Shares:
     """
     data, owners = problem.data, problem.owners
     at, places = np.arange(len(data)), [f"row {label}" for label in data.label]
-    shares = {"more and more from row to row": owners / max(len(data) - 1, 1)}
+    shares = {STEADILY: owners / max(len(data) - 1, 1)}
     if joint is not None:
         unit, si = display("angle" if problem.robot.joint_types[joint] == "revolute" else "length")
         side = signs(problem.robot.joint_map)[joint]
@@ -705,12 +712,16 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
     def gear(i: int, j: int, coefficients: Array) -> tuple[str, str]:
         factor = coefficients[0]
         one, other = (numbered(k, robot.joint_names) for k in (i, j))
-        what = f"joint {one} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
+        moves, transmission = GEARS[robot.joint_types[i]]
+        much = f"{three_digits(100 * abs(factor))} % {'more' if factor > 0 else 'less'}"
+        what = f"joint {one} {moves} {much} than its encoder reads ({transmission})"
         if i != j:
             sign = signs(robot.joint_map)
             part = sign[i] * factor * sign[j]
-            what = f"joint {one} is coupled to joint {other} (q{i + 1} {part:+.4f} q{j + 1})"
-            if abs(part) < COUPLED:
+            mixed = robot.joint_types[i] != robot.joint_types[j]
+            units = " in m and rad" * mixed
+            what = f"joint {one} is coupled to joint {other} (q{i + 1} {part:+.4f} q{j + 1}{units})"
+            if abs(part) < COUPLED and not mixed:
                 return what, "no gear has so small a ratio: check bearings, hoses and mounting of both joints"
         return what, coupling(joint_map(i, j, coefficients))
 
@@ -721,24 +732,28 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
     if len(of_zero) == len(robot.mdh):
         way = np.diff(q, axis=0, prepend=q[:1])[problem.owners]
         lag = np.sum([zero * way[:, i] for i, zero in of_zero.items()], axis=0)
-        remedy = "read both when the arm stands still"
+        yield _lag(lag, "joint values", "read both when the arm stands still")
 
-        def lags(c: Array) -> tuple[str, str]:
-            way = "lag behind" if c[0] > 0 else "run ahead"
-            return f"joint values {way} by {100 * abs(c[0]):.2g} % of each move", remedy
 
-        yield Addition(lag[:, None], lags)
+def _lag(column: Array, what: str, remedy: str) -> Addition:
+    """Return that values are those of a part of the way from the row before, by the equations (m,) of the whole way."""
+
+    def said(c: Array) -> tuple[str, str]:
+        return f"{what} {'lag behind' if c[0] > 0 else 'run ahead'} by {100 * abs(c[0]):.2g} % of each move", remedy
+
+    return Addition(column[:, None], said)
 
 
 def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterator[Addition]:
     """Yield the scale and the offset of lengths, and of positions the scales and skews of their axes."""
     free = problem.parameters.free
     base = [free.names.index(f"base_{c}") for c in "xyz" if f"base_{c}" in free.names]
-    y = np.zeros((len(problem.data), 3))
+    y, way = np.zeros((2, len(problem.data), 3))
     lengths = np.zeros((len(problem.data), 2))
     for block in problem.data.blocks:
         if block.measurement.name in ("position", "pose") and len(base) == 3:
             y[block.row] = block.y[:, :3]
+            way[block.row] = np.diff(y[block.row], axis=0, prepend=y[block.row][:1])
         elif block.measurement.name in ("cable", "distance"):
             lengths[block.row] = np.column_stack([block.y, np.ones(len(block.y))])
     along = lengths[problem.owners]
@@ -752,19 +767,26 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         radial = y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
         along += np.column_stack([np.sum(of_axis * y, axis=1), np.sum(of_axis * radial, axis=1)])
 
-    def scaled(column: Array, what: str, remedy: str, of: str = "too long") -> Addition:
+    def too(what: str, size: float, unit: str) -> str:
+        return f"{what} {three_digits(abs(size))} {unit} too {'long' if size > 0 else 'short'}"
+
+    def scaled(column: Array, what: str, remedy: str, of: str = "") -> Addition:
         # a scale that shrinks positions to half and less fits values that have nothing to do with the robot
-        return Addition(column[:, None], lambda c: (f"{what} {100 * c[0]:+.2g} % {of}", remedy), most=0.5)
+        said = f"{what} {{:+.2g}} % {of}".format if of else partial(too, what, unit="%")
+        return Addition(column[:, None], lambda c: (said(100 * c[0]), remedy), most=0.5)
 
     def longer(share: Array | float, when: str, remedy: str) -> Addition:
-        said = "{}measured distances are {} mm too long".format
-        return Addition((along[:, 1] * share)[:, None], lambda c: (said(when, three_digits(1e3 * c[0])), remedy))
+        said = partial(too, f"{when}measured distances are", unit="mm")
+        return Addition((along[:, 1] * share)[:, None], lambda c: (said(1e3 * c[0]), remedy))
 
     yield scaled(along[:, 0], "measured lengths are", "check the scale of the instrument")
     yield longer(1.0, "", "check the instrument's zero and the reflector's radius")
     for when, share in _shares(problem).items():
         yield longer(share, f"{when} ", "check the reflector and its radius in these rows")
-    if y.any():  # of an instrument at the origin: index of the vertical circle, eccentricity of both
+    if y.any():
+        of_way = -np.sum(of_axis * way[problem.owners], axis=1)
+        yield _lag(of_way, "measured positions", "turn off the instrument's filter, or wait until it has settled")
+        # of an instrument at the origin: index of the vertical circle, eccentricity of both
         flat = np.linalg.norm(y[:, :2], axis=1, keepdims=True)
         radius = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
         turn = np.column_stack([-y[:, 1], y[:, 0], np.zeros(len(y))])

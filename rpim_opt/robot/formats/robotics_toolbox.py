@@ -26,6 +26,7 @@ HEADERS = {"theta": "theta [rad]", "d": "d [m]", "a": "a [m]", "alpha": "alpha [
 def read_links(path: Path) -> RawTable:
     """Return the table of a script's links, in their order."""
     text = re.sub(r"\.\.\.[^\n]*\n|[%#][^\n]*|\b(?:np|numpy|math)\.", "", decoded(path)[0]).replace('"', "'")
+    text = re.sub(r"\b(?:deg2rad|radians)\(([^()]*)\)", r"\1*pi/180", text)
     columns: dict[str, list[str]] = {header: [] for header in HEADERS.values()}
     for kind, craig, inside in LINK.findall(text):
         vector = re.match(r"\s*\[([^\]]*)\]", inside)

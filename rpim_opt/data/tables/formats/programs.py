@@ -4,7 +4,7 @@ FANUC ``P[1:"name"]{ UF : 0, UT : 1, J1= 10.000 deg, ... };``; KUKA ``DECL E6AXI
 ``CONST jointtarget P1:=[[10,-90,...],[9E9,...]];``; Universal Robots ``movej([0.1, -1.57, ...])`` and ``P1_q = [...]``
 in rad, ``p[...]`` in m and rad; Yaskawa ``C00000=10.0,-90.0,...`` below ``///POSTYPE ANGLE``; Kawasaki
 ``#p1 10.0 -90.0 ...`` below ``.JOINTS``; Mitsubishi ``J1=(+10.00,-90.00,...)``; Staubli
-``<Value key="0" j1="10" j2="-90" ... />``. External axes are left out but KUKA's first, E1.
+``<Value key="0" j1="10" j2="-90" ... />``. External axes are left out but the first of KUKA and ABB, E1.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
 FANUC = re.compile(r'P\[(\d+)(?::"([^"]*)")?\]\s*\{(.*?)\};', re.DOTALL)
 KUKA = re.compile(r"(?:(?:E6AXIS|AXIS|E6POS|POS|FRAME)\s+(\w+)\s*=|PTP|LIN)\s*\{([^{}]{0,500})\}", re.IGNORECASE)
-ABB_JOINTS = re.compile(r"(?:jointtarget\s+(\w+)\s*:=|MoveAbsJ)\s*\[\s*\[([^\]]*)\]", re.IGNORECASE)
+ABB_JOINTS = re.compile(
+    r"(?:jointtarget\s+(\w+)\s*:=|MoveAbsJ)\s*\[\s*\[([^\]]*)\](?:\s*,\s*\[([^\],]*))?", re.IGNORECASE
+)
+NO_AXIS = 9e9  # ABB's value of an external axis that is not there
 ABB_POSES = re.compile(r"(?:robtarget\s+(\w+)\s*:=|Move[JL])\s*\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]", re.IGNORECASE)
 UR = re.compile(rf"(?:(\w+)\s*=|move[jlp]\s*\()\s*(p?)\[\s*((?:{NUMBER}\s*,\s*){{5}}{NUMBER})\s*\]", re.IGNORECASE)
 YASKAWA = re.compile(r"^[ \t]*([BCP]+\d+)[ \t]*=[ \t]*([-+\d.][-+\d., \t]*)$", re.MULTILINE)
@@ -81,10 +84,14 @@ def read_kuka(text: str) -> Rows:
 
 
 def read_abb(text: str) -> Rows:
-    """Return the targets; a quaternion has w first."""
+    """Return the targets, with the first external axis as KUKA's E1; a quaternion has w first."""
     text = re.sub(r"!.*", "", text)
     poses = [_listed(name, f"{place},{turn}", [*PLACE, *TURN]) for name, place, turn in ABB_POSES.findall(text)]
-    return _rows([_listed(name, cells) for name, cells in ABB_JOINTS.findall(text)] or poses)
+    targets = []
+    for name, cells, external in ABB_JOINTS.findall(text):
+        rail = {"E1 [mm]": external} if float(external or NO_AXIS) < NO_AXIS else {}
+        targets.append((name, rail | dict(_listed(name, cells)[1])))
+    return _rows(targets or poses)
 
 
 def read_urscript(text: str) -> Rows:
