@@ -151,7 +151,7 @@ Convention = Annotated[str, Option(help="Convention of --mdh: modified (Craig), 
 TIP = "The reflector is the tip link: write its identified pose."
 PERMITTED = "Largest permitted error [mm]: exit code 1 if exceeded; default: the result's limit."
 REMAINING = "Largest residual error plus its U (k = 2) [mm]: exit code 1 if exceeded; default: the result's limit."
-ORIENTATION = "Correct the orientation of all targets, or of none; default: of all if its U is below the nominal error."
+ORIENTATION = "Correct all orientations, or none; default: all, if standard uncertainties are below corrections."
 Workers = Annotated[int, Option(help="Number of parallel processes.")]
 Resume = Annotated[Choice, Option(help="Resume an interrupted run, or discard it and start again.")]
 Table = Annotated[File, Option(help="CSV file for the rows.")]

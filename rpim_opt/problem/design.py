@@ -107,8 +107,8 @@ def choose(
     any set can reach. The largest weights are rounded and improved by exchanges (Fedorov 1972).
 
     The first block of the problem's data defines what is measured. ``candidates`` (M, dof) are joint values of the
-    controller that could be measured, ``measured`` rows that are there already, which M then counts, too. InputError
-    for another criterion, a count that the candidates do not allow, or measurements between two points.
+    controller that could be measured, ``measured`` a `Dataset` of rows that are there already, which M then counts,
+    too. InputError for another criterion, a count that the candidates do not allow, or measurements between two points.
 
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem

@@ -80,9 +80,11 @@ def progress() -> Iterator[Callable[[str], None]]:
 
 
 def written_to(path: Path | None, text: str) -> list[Path]:
-    """Write a text if a path is given, and return the paths written."""
+    """Write a table if a path is given, and return the paths written; refuse a controller's format."""
     if path is None:
         return []
+    if path.suffix.lower() not in ("", ".csv", ".txt"):
+        raise InputError("--out", f"'{path}'", "a table, .csv: no program of a controller is written")
     write_text(path, text)
     return [path]
 

@@ -17,6 +17,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import inside, read_toml
 from rpim_opt.basics.schema import Angle, Length, Name, Table, validate
+from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import accepted_units, fits, quantities, split_unit
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import FRAMES
@@ -469,7 +470,14 @@ def stated_prior(
         load = partial(load_result, measurements=measurements)
         if table.earlier:
             with at_key("prior.from", path):
-                prior &= Prior.from_result(load(files[table.earlier]), table.inflate, table.without)
+                earlier = load(files[table.earlier])
+                found = earlier.problem.parameters.free
+                of_robot = np.array(found.names)[~found.of_frames].tolist()
+                missed = [name for name in of_robot if name not in parameters.free.names]
+                if missed := [name for name in missed if not any(fits(name, each) for each in table.without)]:
+                    accepted = "them in `identify`, or in prior.without"
+                    raise InputError("", f"parameters that are not identified here ({listed(missed)})", accepted)
+                prior &= Prior.from_result(earlier, table.inflate, table.without)
         if table.population:
             with at_key("prior.population", path):
                 prior &= Prior.from_population({name: load(files[name]) for name in table.population})

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from rpim_opt.basics.arrays import TINY, Array, rms, statistics
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import counted, joined, table, three_digits
 from rpim_opt.basics.units import display, printed
 from rpim_opt.bayes.model_selection import deviations, named
@@ -39,7 +39,14 @@ from rpim_opt.problem.multi_robot import identifying_sessions
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import placed, same_place
 from rpim_opt.robot.kinematics import FRAME, frame_numbers
-from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session, session_prefix
+from rpim_opt.robot.parameters import (
+    Parameters,
+    is_joint_offset,
+    of_session,
+    reflectors,
+    session_prefix,
+    tool_prefix,
+)
 from rpim_opt.store.result_file import content
 from rpim_opt.use.sessions import base_frame, registered_again
 
@@ -168,6 +175,7 @@ class Update:
         found = [cause.gain - AS_GOOD for cause in self.changes[:1] if self.changed]
         rivals = [c for c in self.causes[1:] if c.probability > RIVAL or any(c.gain > least for least in found)]
         rivals = [c for c in rivals if not any({*c.members} > {*cause.members} for cause in self.changes[:1])]
+        rivals = [c for c in rivals if c.name not in {cause.name for cause in self.changes}]
         if not (rivals and self.changes):
             return ""
         frames = [cause.name for cause in rivals if cause.kind == "frame"]
@@ -252,8 +260,8 @@ def update(
     elsewhere = not (released or unplaced) and _base_elsewhere(result, problem, base, prior_inflation)
     released += base * elsewhere
     released += tuple(name for name in unplaced if name not in released)
-    # a base that was reset may be anywhere: then it is registered again
-    start = None if base and {*base} <= {*released} else previous_deviations(result, problem)
+    anywhere = bool(base) and {*base} <= {*released}  # a base that was reset is registered again
+    start = None if anywhere else previous_deviations(result, problem)
     found = _in_turn(result, problem, released, prior_inflation, start, say, False)
     if len(found[3]) > FEW or not found[-1].likely:  # many changes of single parameters and readings may be one link
         of_link = _in_turn(result, problem, released, prior_inflation, start, say, True)
@@ -272,19 +280,19 @@ def update(
         result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],
         len(result.problem.labels), {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
         prior_inflation, tuple(name for name in released if name not in unplaced), left_out,
-        tuple(_unresolved(vague, changes, after)),
+        tuple(_unresolved(vague, bool(reset), after)),
     )  # fmt: skip
     held_out = None if {*released} - {*unplaced} else result.record.validation  # which was measured before a change
     figures, said = _errors(result, updated, held_out)
-    registered = " ".join(filter(None, [_bases(result, updated, data) if elsewhere else "", said]))
+    registered = " ".join(filter(None, [_bases(result, updated, data) if anywhere else "", said]))
     updated = replace(updated, record=_carried_on(result.record, last, source))
     return Update(updated, first[1], after, changes, first[0], moved, len(data), figures, registered, vague)
 
 
-def _unresolved(vague: Sequence[str], changes: Sequence[Cause], after: Fit) -> Iterator[str]:
+def _unresolved(vague: Sequence[str], reset: bool, after: Fit) -> Iterator[str]:
     """Say what new rows do not determine, and that nothing explains them."""
     if vague:
-        omit = ", or omit --reset if nothing was moved" * bool({*vague} - {cause.name for cause in changes})
+        omit = ", or omit --reset if nothing was moved" * reset
         yield (
             f"The new rows do not determine {joined(vague)}: measure more configurations, at least three with the "
             f"reflector's positions not on a line{omit}."
@@ -430,7 +438,7 @@ def _bases(result: Calibration, updated: Calibration, data: Dataset) -> str:
     place = registration(updated.problem.parameters.free, data)
     return (
         f"The instrument or the base moved: in the instrument's frame the base is at {now}, previously at {was}. It "
-        f"was registered again, as with --reset '{place}*'."
+        f"was registered again (--reset '{place}*')."
     )
 
 
@@ -567,6 +575,10 @@ def with_data(result: Calibration, data: Dataset) -> CalibrationProblem:
     problem = result.problem
     if not isinstance(problem, CalibrationProblem):
         raise InputError("the result", "a calibration of data in blocks", "one of measurements in memory")
+    known = reflectors(problem.parameters.names)
+    for marker in [marker for block in data.blocks for marker in block.markers if marker and marker not in known]:
+        accepted = f"{choices(marker, known)}; of a new reflector the name of one before, and --reset 'tool_NAME_*'"
+        raise InputError("column marker", f"'{marker}'", accepted)
     return identifying_sessions(problem.on(data))
 
 
@@ -719,11 +731,12 @@ class Misfit:
 def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -> list[Cause]:
     """Return the candidate changes: parameters, whole frames and whole transmission errors that were not reset.
 
-    A motor that moves several joints shifts all their zeros, and a plate moves all its reflectors. With ``bent`` two
+    A motor that moves several joints shifts all their zeros, and a plate all measured reflectors. With ``bent`` two
     joint zeros at once are candidates, and links: all six numbers between two joints, which explain most of what moves
     a frame.
     """
-    free, place = problem.parameters.free, registration(problem.parameters.free, problem.sample().data)
+    free, data = problem.parameters.free, problem.sample().data
+    place, measured = registration(free, data), {tool_prefix(m) for block in data.blocks for m in block.markers}
     causes = []
     wholes: dict[tuple[str, str], list[str]] = {}
     for name, frame, curve in zip(free.names, free.of_frames, free.of_curves, strict=True):
@@ -735,7 +748,7 @@ def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -
             wholes.setdefault((name.rpartition("_")[0], kind), []).append(name)
         else:
             causes.append(Cause(name, kind, (name,)))
-    tools = [names for (name, kind), names in wholes.items() if kind == "frame" and name.startswith("tool")]
+    tools = [names for (name, kind), names in wholes.items() if kind == "frame" and f"{name}_" in measured]
     if len(tools) > 1:
         wholes["all reflectors", "frame"] = [name for names in tools for name in names]
     known = {*free.names} - {*reset}

@@ -443,6 +443,14 @@ def tenths(q: np.ndarray) -> np.ndarray:
     return np.radians(np.degrees(q).round(1))
 
 
+def from_horizontal(q: np.ndarray) -> np.ndarray:
+    """Return the values of a controller that counts joint 3 as FANUC's do, downwards, and joints 4 and 6 reversed."""
+    counted = q.copy()
+    counted[:, 2] = -q[:, 1] - q[:, 2]
+    counted[:, [3, 5]] *= -1
+    return counted
+
+
 def of_joint_rows(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     """Change the joint values (N, dof) of all rows."""
     return joints(lambda q: change(q[:, 0])[:, None])
@@ -463,6 +471,14 @@ IN_TABLES |= {
     ),
     "commanded degrees": (commanded, "these are commanded joint values"),
     "worn circles of the instrument": (values(of_worn_circles), "angles of the instrument at the origin"),
+    "a filter of the instrument": (
+        values(lambda y: np.vstack([y[:1], 0.998 * y[1:] + 0.002 * y[:-1]])),
+        "measured positions lag behind by 0.2 % of each move",
+    ),
+    "joint 3 from the horizontal, and three joints reversed": (
+        of_joint_rows(from_horizontal),
+        "joint 3 coupled to joint 2 and joint",
+    ),
     "mirrored, and joint 1 reversed": (
         both(values(lambda y: y * [1, -1, 1]), flipped(0)),
         "left-handed measured frame with joint 1 reversed",

@@ -142,6 +142,18 @@ def test_a_folder_takes_an_earlier_result_as_its_prior(folder: Path, tmp_path: P
     assert "earlier.json" in found.record.files
 
 
+def test_what_an_earlier_result_knows_of_the_robot_is_not_dropped_in_silence(folder: Path) -> None:
+    """Sag of an earlier `auto` calibration was, and the robot stood straight."""
+    problem = ro.load("position").problem
+    p = problem.parameters
+    sagging = problem.identifying(p.identified | np.char.startswith(np.array(p.names), "compliance"))
+    ro.store.save_result(ro.calibrate(sagging, ro.tikhonov, 1.0), folder / "earlier.json")
+    with pytest.raises(ro.InputError, match=r"prior.from: found parameters .* \(compliance1, .*them in `identify`, or"):
+        with_prior(folder, '[prior]\nfrom = "earlier.json"')
+    stated = with_prior(folder, '[prior]\nfrom = "earlier.json"\nwithout = ["compliance?"]').prior
+    assert len(stated.statements[0].names) == p.identified.sum()
+
+
 def test_a_folder_learns_from_a_population(folder: Path) -> None:
     problem = ro.load("position").problem
     results = {}

@@ -18,6 +18,7 @@ from rpim_opt.calibration.uncertainty import position_budget
 from rpim_opt.robot.chain import placed
 from rpim_opt.store import problems_folder
 from rpim_opt.store.result_file import digest
+from tests.calibration.mistakes import simulated_arm
 from tests.simulate import simulated
 from tests.test_cli import run
 
@@ -381,6 +382,26 @@ def test_nominal_errors_are_of_all_reflectors_after_an_update_by_one(tmp_path) -
     ro.store.save_result(updated, tmp_path)
     loaded = ro.load_result(tmp_path / "result.json")
     np.testing.assert_allclose(loaded.nominal_errors(), updated.nominal_errors(), rtol=1e-6)
+
+
+def test_new_reflectors_in_the_place_of_some_are_one_change() -> None:
+    """The others were released, too, and undetermined: the update was refused, with advice on --reset."""
+    problem = simulated_arm("ur5e", count=50, markers=3)
+    data, names = problem.data, problem.parameters.free.names
+    later = data.configuration >= 40
+    first = ro.calibrate(problem.on(data.take(np.flatnonzero(~later))), ro.tikhonov, weight=1.0)
+    unmeasured = data.blocks[0]
+    checks = problem.on(data.take(np.setdiff1d(np.flatnonzero(later), unmeasured.row)))
+    moved = np.array([8e-3 * (name.startswith("tool") and name.endswith(("_x", "_z"))) for name in names])
+    moves = zip(checks.data.blocks, checks.modelled(first.x + moved), checks.modelled(first.x), strict=True)
+    blocks = tuple(replace(block, y=block.y + there - here) for block, there, here in moves)
+    found = ro.use.update(first, replace(checks.data, blocks=blocks))
+    assert [cause.name for cause in found.changes] == ["all reflectors"]
+    assert not any(name.startswith(f"tool_{unmeasured.markers[0]}_") for name in found.changes[0].members)
+    assert found.result.verdict.delivered
+    named = r"'X', accepted: .*; of a new reflector the name of one before, and reset 'tool_NAME_\*'"
+    with pytest.raises(InputError, match=named):
+        ro.use.update(first, ro.Dataset.of(data.q[:8], np.zeros((8, 3)), SIGMA, marker=["X"] * 8))
 
 
 def test_gear_ratios_can_be_reset() -> None:
