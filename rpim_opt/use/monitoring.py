@@ -459,9 +459,9 @@ def _explained(explanations: _Explanations, level: float, single: bool) -> _Expl
                 enough = len(wrong) <= 1 and beside.fit.likely
                 return _Explanation(log + more, best._replace(others=tuple(apart)), tuple(wrong), enough)
             if not wrong and best.cause.gain > NEARLY * misfit.fit.squares:
-                nearly = best
+                nearly = best._replace(moved=None)
             more = of_reading
         log += more
         wrong.append(out.cause)
         kept[explanations.equations[out.cause.members]] = 0.0
-    return _Explanation(-np.inf, nearly, (), nearly is not None)
+    return _Explanation(-np.inf, nearly, (), False)

@@ -185,14 +185,15 @@ def test_a_link_that_was_bent_is_one_change() -> None:
     assert (drift.cause.name, drift.first) == ("link between joints 3 and 4", 0)
 
 
-def test_two_motors_that_were_exchanged_at_once_are_no_bent_link() -> None:
-    """Their zeros are two of the six numbers of the link between them."""
-    robot = happened(6, theta3=1.3e-3, theta4=-9e-4)
+@pytest.mark.parametrize("zeros", [("theta3", "theta4"), ("theta2", "theta5")])
+def test_two_motors_that_were_exchanged_at_once_are_both_named(zeros: tuple[str, str]) -> None:
+    """Neighbours' zeros are two of the six numbers of a link; of others the larger one alone was named."""
+    robot = happened(6, **dict(zip(zeros, (1.6e-3, -9e-4), strict=True)))
     first = ro.calibrate(robot.problem.on(robot.before))
     drift = ro.use.monitor(first, robot.after).drift
     assert drift is not None
-    assert str(drift.cause) == "joint offsets theta3 and theta4"
-    assert [cause.name for cause in ro.use.update(first, robot.after).changes] == ["theta3", "theta4"]
+    assert str(drift.cause) == f"joint offsets {' and '.join(zeros)}"
+    assert [cause.name for cause in ro.use.update(first, robot.after).changes] == [*zeros]
 
 
 def test_what_an_update_does_not_explain_is_not_delivered_by_its_file_either(tmp_path) -> None:
