@@ -145,6 +145,19 @@ def test_an_instrument_of_another_scale_looks_like_a_longer_robot(error: float) 
     assert not ro.calibrate(problem).verdict.caution
 
 
+@pytest.mark.parametrize("name", ["seven_axis", "position"])
+def test_a_scale_is_estimated_by_the_lengths_that_data_determine(name: str) -> None:
+    """Lengths that the prior alone determines are near their nominal values, which was evidence against a scale."""
+    problem = ro.load(name).problem
+    (block,) = problem.data.blocks
+    exact = problem.modelled(np.zeros(len(problem.parameters.free)))[0]
+    noise = 5e-5 * np.random.default_rng(0).normal(size=exact.shape)
+    scaled = problem.on(replace(problem.data, blocks=(replace(block, y=1.008 * exact + noise),)))
+    said = re.search(r"Lengths of the robot deviate by \+([.\d]+) % in common", str(ro.calibrate(scaled).verdict))
+    assert said
+    assert float(said[1]) == pytest.approx(0.8, rel=0.03)
+
+
 def test_lengths_that_shrink_to_half_are_no_scale() -> None:
     """Those of rows that are not related do."""
     problem = ro.load("position").problem
