@@ -19,7 +19,7 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import from_matrices, pose, position
 from rpim_opt.robot.parameters import session_prefix
 
-AT_REST = 1e-4  # [rad, m] by which joint values of an arm at rest scatter at most; no two poses are so near on purpose
+AT_REST = 1e-4  # [rad, m] joint values of an arm at rest scatter by less; no two poses are chosen so close
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,12 +28,12 @@ class Block(Brief):
 
     ``q`` (N, p, dof) are the controller's joint values [rad or m] at the p points of a row, ``y`` (N, c) the measured
     values [SI] in the order of the measurement's columns, ``covariance`` (N, k, k) that of the residual's components
-    [SI], or (1, k, k) when it is the same for all rows, ``row`` (N,) which row of the dataset each one is. ``markers``
-    are the reflectors of the points and ``fixture`` is which anchor, plane or sphere, ``""`` for the only one;
-    ``robot`` is whose rows these are.
+    [SI], or (1, k, k) if all rows have the same, ``row`` (N,) the rows' numbers in the dataset. ``markers`` are the
+    points' reflectors, ``fixture`` is the anchor, plane or sphere (``""`` for a single one), ``robot`` the robot's
+    name.
 
-    Perhaps there are what `Dataset.of` takes besides: ``torque`` and ``approach`` (N, p, dof), ``payload`` (N,) (else
-    that of the robot's `Gravity`), names (N, p) of the ``point`` and (N,) of the ``session``, and ``columns`` (N,).
+    Optional, as in `Dataset.of`: ``torque`` and ``approach`` (N, p, dof), ``payload`` (N,) (default: that of the
+    robot's `Gravity`), ``point`` (N, p) and ``session`` (N,), both names, and ``columns`` (N,) by name.
     """
 
     measurement: Measurement
@@ -89,8 +89,8 @@ class Block(Brief):
 class Dataset(Tabled):
     """Rows of measurements, of one kind or several.
 
-    ``blocks`` are the rows, grouped by what evaluates them, ``label`` their N unique labels, and ``configuration`` (N,)
-    the numbers of their configurations: rows of one stay together in cross-validation.
+    ``blocks`` are the rows, grouped by measurement model, reflectors and fixture; ``label`` are N unique labels;
+    ``configuration`` (N,) are numbers of configurations, which cross-validation never divides.
 
     >>> import rpim_opt as ro
     >>> data = ro.load("paper_arm").problem.data
@@ -206,8 +206,8 @@ class Dataset(Tabled):
     def grouped_by_points(self) -> Dataset:
         """Return the measurements with one configuration number for all rows that share an unknown point.
 
-        Those are touches of a point or plane, of those with a known relation, and what was measured in the same
-        configuration: a fold of a cross-validation has all of them or none.
+        Such rows are touches of one point or plane, or of several with a known relation. Rows of one configuration stay
+        together, so that a fold of a cross-validation has all of them or none.
         """
         touches = (zip(block.row, block.touched, strict=True) for block in self.blocks if block.touched is not None)
         pairs = [(row, name) for rows in touches for row, names in rows for name in names]
@@ -247,18 +247,18 @@ class Dataset(Tabled):
     ) -> Dataset:
         """Return a dataset from arrays; rows in which the arm stood still are one configuration (`stops`).
 
-        ``q`` (N, dof) are joint values of the controller [rad or m], (N, p, dof) where a row involves p points; ``y``
-        (N, c) are measured values [SI], poses also as transforms (N, 4, 4). ``sigma`` is the standard deviation [SI] of
-        all k components of the residual, of each, (k,), of every row, (N,), or both, (N, k); or their covariance,
-        (k, k) or (N, k, k). Of k rows they are those of the components. A position has the components x, y, z, a pose
-        x, y, z [m], rx, ry, rz [rad].
+        ``q`` (N, dof) are joint values of the controller [rad or m], (N, p, dof) if a row involves p points; ``y`` (N,
+        c) are measured values [SI], of poses also transforms (N, 4, 4). ``sigma`` is the standard deviation [SI] of the
+        residual: a number for all k components, (k,) per component, (N,) per row, or (N, k); or a covariance, (k, k) or
+        (N, k, k). With N = k, (k,) is per component. The components are x, y, z of a position, and x, y, z [m], rx, ry,
+        rz [rad] of a pose.
 
-        ``label`` are N row labels, numbers from 1 by default; ``measurement`` is what the instrument sees, or the name
-        of a ready type, ``"cable"``. ``torque`` [Nm] and ``approach``, the directions of the last movement (-1, 0 or
-        +1), are (N, dof) or (N, p, dof) as q, ``payload`` (N,) is the mass at the flange [kg], ``columns`` are further
-        columns by name, (N,) each [SI], which terms and measurements of your own see; ``session`` and ``point`` are N
-        names of the sessions, and of the points that were touched or seen. Where there are several, ``marker``, (N,)
-        or (N, p), are names of the reflectors, and ``fixture``, (N,), of the anchors, planes or spheres.
+        ``label`` are N row labels, by default numbers from 1; ``measurement`` is the measurement type, or the name of a
+        ready one, ``"cable"``. ``torque`` [Nm] and ``approach``, the directions of the last movement (-1, 0 or +1),
+        have the shape of q; ``payload`` (N,) is the mass at the flange [kg]; ``columns`` maps names to further columns
+        (N,) [SI] for user-defined terms and measurement types; ``session`` and ``point`` are N names of sessions, and
+        of touched or seen points. ``marker``, (N,) or (N, p), and ``fixture``, (N,), name the reflector, and the
+        anchor, plane or sphere, if there are several.
 
         InputError for an unknown name, shapes that do not fit together, numbers that are not finite, or a deviation
         that is not positive.
@@ -327,9 +327,9 @@ def _numbered(keys: Iterable[Any]) -> np.ndarray:
 
 
 def stops(q: Array) -> np.ndarray:
-    """Return numbers (N,) of joint values (N, ...) [rad or m]: those that differ by no more than `AT_REST` are one.
+    """Return group numbers (N,) of joint values (N, ...) [rad or m] that differ by at most `AT_REST`.
 
-    In lexicographic order, each that belongs to no earlier one takes all within that distance.
+    In lexicographic order, each value without a group takes all others without one within that distance.
     """
     values, number = np.unique(q.reshape(len(q), -1), axis=0, return_inverse=True)
     tree = scipy.spatial.cKDTree(values)
@@ -343,9 +343,9 @@ def stops(q: Array) -> np.ndarray:
 
 
 def _united(group: np.ndarray, rows: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """Return numbers (N,) of N rows' groups, where groups of which ``rows`` (K,) have equal ``keys`` (K,) are one.
+    """Return group numbers (N,) of N rows, where groups are merged whose ``rows`` (K,) have equal ``keys`` (K,).
 
-    They are in the order of the groups: an order of sums that changes would change last digits of results.
+    They keep the order of the groups: another order of summation would change the last digits of results.
     """
     groups = int(group.max(initial=-1)) + 1
     count = groups + int(keys.max(initial=-1)) + 1

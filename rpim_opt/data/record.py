@@ -18,20 +18,20 @@ from rpim_opt.data.dataset import Dataset
 
 PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
 Side = tuple[float, float]
-CONFIDENCE = 0.95  # probability with which a limit is to be kept, where no other is stated
-UNLIKELY = 0.01  # p-value below which readings contradict what is stated or predicted of them
+CONFIDENCE = 0.95  # default probability with which a limit has to be kept
+UNLIKELY = 0.01  # p-value below which readings contradict stated or predicted values
 
 
 @dataclass(frozen=True)
 class Requirement:
     """A tolerance on the position error, and the region where it applies.
 
-    The ``limit`` bounds the distance between the position reached and the one that the model predicts [m], kept
-    with probability ``confidence`` at every configuration of the region: the nominal reflector in a ``box``, sides
-    (low, high) along x, y, z [m] in the robot's base frame, anywhere by default; ``joints`` within sides (low, high)
-    [rad or m], by their number from 1, the others within what was measured; ``measured``: at the configurations there
-    that were measured alone, and nothing between. ``marker`` is the reflector; the only one,
-    or the first, by default. InputError for a limit or a confidence that nothing can keep, and sides that are not
+    ``limit`` [m] bounds the distance between the reached position and the model's prediction, with probability
+    ``confidence`` at every configuration of the region: the nominal reflector in a ``box``, sides (low, high) along x,
+    y, z [m] in the robot's base frame, anywhere by default; ``joints`` within (low, high) [rad or m], by number from 1,
+    other joints within the measured ranges; ``measured``: only at the measured configurations there. ``marker`` is the
+    reflector, by default the first. InputError for a limit or confidence that nothing can meet, and sides that are not
+    (low, high).
     (low, high).
 
     >>> import rpim_opt as ro
@@ -96,17 +96,17 @@ class Fit(NamedTuple):
 class HeldOut:
     """Errors of a calibration on N rows that it did not use.
 
-    A record keeps them when a final fit uses these rows: they validate the procedure, and the parameters that are
-    delivered come from all rows.
+    A record keeps them when a final fit also uses these rows: they then validate the procedure, while the delivered
+    parameters come from all rows.
 
-    ``used`` is how many rows the parameters came from; ``nominal`` and ``error`` (N,) are errors before and after [m],
-    NaN for rows that measure no length, ``angle`` (N,) those of orientations after [rad], NaN for rows that are no
-    poses. ``sigmas`` (N,) are |S^-1/2 r| of a row's residual r, with S = J C J' + the covariance of a reading (the
-    instrument's as the row states it, and the repeatability) and C the calibration's; ``allowed`` (N,) their limit by
-    Fisher's F, which one of all N exceeds with probability 0.01. Both are NaN where the calibration has no covariance,
-    or none in a direction that the row depends on. ``coverage`` is the share of lengths in the 95 % interval of a
-    reading, ``fit`` how well all equations together agree with their joint prediction, S of all rows; both without rows
-    that a final fit excludes, and None without covariance.
+    ``used`` is the number of rows behind the parameters; ``nominal`` and ``error`` (N,) are errors before and after
+    [m], NaN for rows that measure no length, ``angle`` (N,) those of orientations after [rad], NaN for rows that are
+    not poses. ``sigmas`` (N,) are |S^-1/2 r| of a row's residual r, with S = J C J' + the covariance of a reading (of
+    the instrument, as stated for the row, and repeatability) and C the calibration's covariance; ``allowed`` (N,) are
+    limits by Fisher's F, exceeded by any of the N with probability 0.01. Both are NaN if the calibration has no
+    covariance, or none in a direction that the row depends on. ``coverage`` is the share of lengths in the 95 %
+    interval of a reading, ``fit`` the agreement of all equations with their joint prediction, S of all rows; both
+    disregard rows that a final fit excludes, and are None without covariance.
     """
 
     label: tuple[str, ...]
@@ -130,9 +130,9 @@ class HeldOut:
 class Earlier(NamedTuple):
     """The earlier calibration that served as the prior.
 
-    Its title, when it was made, the digest of its file and its number of rows; the least and the largest value of every
-    joint that it measured [rad or m], by robot; the factor on its standard deviations; parameters that were released,
-    and rows of the new data that were excluded; sentences on what these do not determine, or nothing explains.
+    Its title, date, file digest and number of rows; smallest and largest measured value of every joint [rad or m], by
+    robot; the factor on its standard deviations; released parameters; excluded rows of the new data; sentences on
+    parameters that these leave undetermined, and on unexplained rows.
     """
 
     title: str
@@ -156,17 +156,17 @@ class Earlier(NamedTuple):
 class Record:
     """Where a calibration's data come from, and what was held out.
 
-    ``title`` and ``source`` name what was calibrated and the origin of its data. ``validation`` are measurements
-    that no step of the calibration saw, ``files`` the SHA-256 of the input files by name, ``excluded`` the rows that
-    were left out, label to reason; ``simulated`` is whether the measurements are, ``noise_assumed`` whether their noise
-    is a guess. It was ``made`` then (UTC, ISO 8601), by packages of these ``versions``. ``details`` state who measured,
-    when, with which instrument, as somebody stated it.
+    ``title`` and ``source`` name what was calibrated and the origin of its data. ``validation`` are measurements that
+    no step of the calibration used, ``files`` the SHA-256 of the input files by name, ``excluded`` maps labels of
+    excluded rows to reasons; ``simulated`` states whether the measurements are, ``noise_assumed`` whether their noise
+    is a guess. ``made`` is the time (UTC, ISO 8601), ``versions`` those of packages. ``details`` state who measured,
+    when and with which instrument, in free text.
 
-    The ``requirement`` is what the robot is accepted by, if anything is; ``held_out`` are rows that were judged before
-    they were used, None where validation data are still unused; ``earlier`` the calibrations that this one carries on
-    (`use.update`), the last one last; ``digest`` that of the file that it was read from. Later tables are read as
-    ``reading`` states (`TableOptions.stated`); ``terms`` are those of a Python file in the problem's folder,
-    ``mine:droop``; ``known`` what its prior states of parameters.
+    ``requirement`` is the tolerance to be met, if any; ``held_out`` are rows judged before a final fit used them, None
+    while validation data are unused; ``earlier`` are the calibrations that this one continues (`use.update`), latest
+    last; ``digest`` is that of the file that the record was read from. Later tables are read with the options
+    ``reading`` (`TableOptions.stated`); ``terms`` are those of a Python file in the problem's folder, ``mine:droop``;
+    ``known`` are stated parameter values in the prior.
 
     >>> import rpim_opt as ro
     >>> record = ro.data.Record("Cell 7", source="Tracker campaign of May", excluded={"P17": "reflector bumped"})

@@ -20,17 +20,17 @@ from rpim_opt.robot.mdh import MDH, Robot, numbered
 from rpim_opt.robot.terms import Joint, Symbol, Term
 
 NEAR_PARALLEL = 0.35
-"""Axes nearer to parallel than this [rad] get Hayati's beta, as `problem.near_parallel` proposes.
+"""Axes closer to parallel than this [rad] get Hayati's beta, as `problem.near_parallel` proposes.
 
-An error of an axis moves their common normal, and with it d and theta of both joints, by 1 / sin(angle) times as much:
-beyond three times, prior scales would be wrong (with axes 10 degrees apart errors fell from 0.18 to 0.53 mm to 0.14 to
-0.20 mm on five simulated sets).
+An axis error moves the common normal, and with it d and theta of both joints, 1 / sin(angle) times as much: above a
+factor of 3 prior scales would be wrong (axes 10 degrees apart, five simulated sets: errors of 0.18 to 0.53 mm with beta
+= 0, 0.14 to 0.20 mm with beta).
 """
 ANOTHER_ARM = 0.1  # a robot whose parameters deviate by more than this [m or rad] from a file's is not the file's
 ORIGIN, MOUNT = OF_JOINTS = "origin_", "mount_"
 """Prefixes of the parameters of joints that move, and of fixed joints at the ends of a chain."""
 ORIGIN_SCALES = {ORIGIN: 1.0, MOUNT: 10.0}  # prior standard deviations of their deviations [mm and mrad]
-SAME_PLACE = (0.01, 0.1)  # two frames nearer than this [m], [rad] are one and the same, known twice
+SAME_PLACE = (0.01, 0.1)  # frames closer than this [m], [rad] count as the same frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +40,8 @@ class RobotSetup:
     robot: Robot
     base: Array = field(default_factory=partial(np.zeros, 6))  # x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx
     tool: Array = field(default_factory=partial(np.zeros, 6))
-    names: tuple[str, ...] = ()  # the file's, of the joints
-    notes: tuple[str, ...] = ()  # on what of the file is left out
+    names: tuple[str, ...] = ()  # of the joints in the file
+    notes: tuple[str, ...] = ()  # sentences on what was left out of the file
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +82,11 @@ def describe(
     from frame i's origin to the next axis, which beta_i tilts out of the plane (Hayati 1983): every number stays
     finite and changes little with the axes. Of the two directions of x the one nearer to theta_i = 0 is taken.
 
-    The base has the first axis as z and is where that axis is nearest to the chain's start; it is the identity
-    where that axis is the start's z. The last MDH frame is the last joint's own, turned so that its axis is z.
-    Of ``near`` (n, 5) theta (up to half a turn), the sign of alpha and, where axes are parallel, d are wanted; axes
-    count as near parallel below ``parallel`` [rad]. The fourth result, G (n, 4, 4), is constant: frame of joint i = MDH
-    frame i before its Rot(y, beta_i), times G_i.
+    The z axis of the base is the first joint axis, its origin the point of that axis next to the chain's origin; if the
+    first axis is the chain's own z axis, the base is the identity. The last MDH frame is that of the last joint, turned
+    so that z is its axis. ``near`` (n, 5) is a table to stay close to: it decides the full turns of theta, the sign of
+    alpha and, between parallel axes, d. The fourth result, G (n, 4, 4), is constant: frame of joint i = MDH frame i
+    before its Rot(y, beta_i), times G_i.
     """
     n = len(chain.axes)
     near = np.zeros((n, 5)) if near is None else near
@@ -120,8 +120,8 @@ def corrected(
         O_i  = G_i-1^-1 Rot(y, beta_i-1) Rot(x, alpha_i) Trans(x, a_i) Rot(z, theta_i) Trans(z, d_i) G_i
         tail = G_n^-1 Rot(y, beta_n) tool
 
-    (O_1 with the base in place of G_0^-1.) What joint i's own zero and place are wrong by moves the frame of link i.
-    By default base and tool are the chain's. The length [m], at least one, is that of the arm stretched out.
+    (O_1 with the base in place of G_0^-1.) An error in the zero or place of joint i moves the frame of link i. By
+    default base and tool are the chain's. The length [m] is that of the stretched arm, at least 1 m.
     """
     _, T_base, T_tool, G = describe(chain)
     T_base = T_base if base is None else numeric_frame(base)
@@ -135,7 +135,7 @@ def corrected(
 def require_same_arm(robot: Robot, original: Robot, file: Path) -> list[str]:
     """Refuse a robot whose joints or nominal parameters differ from those of a file, apart from zeros of joints.
 
-    Return sentences on joint values that the file cannot hold (`joint_values`), and on zeros, which origins hold.
+    Return sentences on joint values that the file cannot express (`joint_values`), and on zeros moved into origins.
     """
     if robot.joint_types != original.joint_types:
         found, accepted = ", ".join(robot.joint_types), f"those of the file, {', '.join(original.joint_types)}"
@@ -164,9 +164,10 @@ def require_same_arm(robot: Robot, original: Robot, file: Path) -> list[str]:
 
 
 def joint_values(robot: Robot, original: Robot, file: Path) -> list[str]:
-    """Return a sentence on the values of a file's joints where they are not those of the robot's controller.
+    """Return a sentence on how the values of a file's joints follow from the controller's, if they differ.
 
-    With the file's own joint map F (n, k) and the robot's M they are S q, F S = M; refused where no S is.
+    With F (n, k) the joint map of the file and M that of the robot they are S q, where F S = M; refused without such an
+    S.
     """
     S = np.round(np.linalg.pinv(original.joint_map) @ robot.joint_map, 12)
     wrong = np.flatnonzero(np.abs(original.joint_map @ S - robot.joint_map).max(axis=1) > 1e-9)
@@ -185,7 +186,7 @@ def joint_values(robot: Robot, original: Robot, file: Path) -> list[str]:
 def without_beta(robot: Robot) -> Robot:
     """Return the same arm in four numbers per joint: every Hayati parameter zero, common normals throughout.
 
-    Where axes are nearly parallel the common normal, and with it d of both joints, may be hundreds of metres away.
+    Between nearly parallel axes the common normal, and with it d of both joints, may be hundreds of metres away.
     Refused are a beta after the last joint, and axes so parallel that the four numbers lose more than 1e-9 m or rad.
     """
     table = robot.mdh
@@ -208,8 +209,8 @@ def without_beta(robot: Robot) -> Robot:
 def standard_table(robot: Robot) -> Array:
     """Return the numbers (n, 5) of the same arm in the standard convention, from axis 1 to the same last frame.
 
-    They are those of Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta), in the columns of `MDH`: where
-    no axes need beta, alpha and a one row earlier; else the modified table of the inverse chain, last joint first.
+    They are those of Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta), in the columns of `MDH`: without
+    betas, alpha and a one row earlier; with betas, the modified table of the inverse chain, last joint first.
     """
     table = robot.mdh.copy()
     table[:, :2] = np.vstack([robot.mdh[1:, :2], np.zeros(2)])
@@ -253,7 +254,7 @@ def _step(M: Array, near: Array, parallel: float) -> tuple[float, float, float, 
         a, x = (a, foot / a) if a > 1e-11 else (0.0, np.array([np.cos(theta0), np.sin(theta0), 0.0]))
         x = x - (x @ v) * v  # a short a leaves x inexact
         x = x / np.linalg.norm(x)
-    # cos(theta - theta0) + sin(alpha) sin(alpha0): behind parallel axes theta may be anything, alpha is certain
+    # cos(theta - theta0) + sin(alpha) sin(alpha0): after parallel axes any theta is possible, only alpha is certain
     if x[:2] @ [np.cos(theta0) - v[1] * np.sin(alpha0), np.sin(theta0) + v[0] * np.sin(alpha0)] < -1e-9:
         x = -x
         a = -a
@@ -295,9 +296,9 @@ def origin_numbers(T: np.ndarray, old: Array, size: float) -> tuple[str | None, 
 class Origin(NamedTuple):
     """A joint's origin O, which becomes D O by six numbers in the frame of the joint's parent link."""
 
-    prefix: str  # of its parameters, origin_torso_1_joint_
+    prefix: str  # of its parameters: origin_torso_1_joint_
     frame: Array  # (4, 4) of the parent link in the frame behind the row that carries it
-    up: bool  # whether the chain goes up through the joint
+    up: bool  # whether the chain passes the joint from child to parent
 
 
 class RowOrigins(NamedTuple):
@@ -310,8 +311,8 @@ class RowOrigins(NamedTuple):
 def origins_term(carried: RowOrigins) -> Term:
     """Return the term of the origins after a row of the table, which displace the following frames in order.
 
-    With F the parent link's frame behind the row, a joint that is passed down displaces by F D F^-1, one that is passed
-    up by F D^-1 F^-1; D = Trans(x, y, z) Rot(rz) Rot(ry) Rot(rx).
+    With F the parent link's frame behind the row, a joint passed from parent to child displaces by F D F^-1, one passed
+    from child to parent by F D^-1 F^-1; D = Trans(x, y, z) Rot(rz) Rot(ry) Rot(rx).
     """
     units = dict(zip(FRAME, ("mm",) * 3 + ("mrad",) * 3, strict=True))
     scales = {}

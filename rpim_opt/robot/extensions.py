@@ -17,12 +17,12 @@ from rpim_opt.robot.mdh import MDH, STANDARD, Gravity, Robot
 from rpim_opt.robot.terms import JOINT_TERMS, MOMENT_SCALE, Configuration, Symbol, Weight
 
 GUESS = ((5.0, None), (10.0, 4))
-"""Masses [kg] at the origin of a frame, None for the last: what an arm is taken for that states none."""
+"""Assumed point masses [kg] and the numbers of the frames at whose origins they are (None: the last frame)."""
 AXES = "xyz"
 EXPECTED = 1e-4  # prior scale of an extension's deflection [rad] at the configuration where it is largest
 DRAWS = 300
 SAME = 1e-2
-"""Columns that differ by less, relatively, are redundant: far from rounding, and from tilts of some milliradians."""
+"""Relative difference below which two columns are redundant: far above rounding and tilts of some milliradians."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -30,8 +30,8 @@ class Statics(Weight):
     """Gravity on an arm of nominal geometry in one configuration; quantities are computed at first use."""
 
     joint_types: Sequence[str]
-    q: Sequence[Symbol]  # of the model
-    nominal: Callable[[str], Symbol]  # numbers of the table, nominal("alpha2")
+    q: Sequence[Symbol]  # joint values of the model
+    nominal: Callable[[str], Symbol]  # number of the table by name, nominal("alpha2")
     gravity: Gravity
 
     @property
@@ -112,10 +112,10 @@ def gravity_torques(robot: Robot, q: Array) -> Array:
 
         tau_i = z_i . sum over masses that joint i carries of m (p - o_i) x g
 
-    Minus the slope of the potential energy: positive where gravity turns the joint the positive way.
+    This is minus the derivative of the potential energy: positive where gravity turns the joint in its positive sense.
 
-    At joint values q (N, dof) of the controller [rad or m], with the payload of the robot's `Gravity`. Returned are
-    (N, dof) [Nm], about the axes of the table; zero for prismatic joints.
+    ``q`` (N, dof) are the controller's joint values [rad or m]; the payload is that of the robot's `Gravity`. The
+    result is (N, dof) [Nm], about the axes of the table; zero for prismatic joints.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -154,9 +154,9 @@ def _draws(robot: Robot) -> Array:
 def moment_names(robot: Robot) -> tuple[str, ...]:
     """Return the non-redundant parameters ``moment{i}_{k}{a}`` of a robot.
 
-    Over random joint values, those whose slope (`moment_slopes`) is neither constant nor, but for a factor and a
-    constant, that of an earlier one of the same joint. With constants they represent all that masses of links can do to
-    an arm of revolute joints.
+    Two parameters of a joint are redundant if their slopes (`moment_slopes`) over random joint values differ only by a
+    factor and a constant; one of them is returned, none for a constant slope. With joint offsets they represent all
+    deflections that the masses of links can cause in an arm of revolute joints.
     """
     n = len(robot.mdh)
     slopes = moment_slopes(robot, _draws(robot))
@@ -166,7 +166,7 @@ def moment_names(robot: Robot) -> tuple[str, ...]:
         for k, a in np.ndindex(n, len(AXES)):
             v = slopes[:, i, k, a] - slopes[:, i, k, a].mean()
             size = float(np.linalg.norm(v))
-            # slopes are of size 1: this is a share of that
+            # slopes are of size 1: SAME is a share of that
             if size < SAME * np.sqrt(DRAWS):
                 continue
             v = v / size
@@ -179,7 +179,7 @@ def moment_names(robot: Robot) -> tuple[str, ...]:
 def model_extensions(robot: Robot) -> dict[str, tuple[str, ...]]:
     """Return the parameters of all model extensions of a robot, by effect.
 
-    Compliances are those of the joints whose torque of gravity changes with the configuration.
+    A compliance is listed for every joint whose gravity torque changes with the configuration.
 
     >>> import rpim_opt as ro
     >>> found = ro.robot.model_extensions(ro.load("paper_arm").problem.robot)
@@ -202,8 +202,8 @@ def model_extensions(robot: Robot) -> dict[str, tuple[str, ...]]:
 def extension_scales(robot: Robot, names: Iterable[str]) -> Array:
     """Return the prior scales (n,) [SI] of model extensions: a deflection of 0.1 mrad where it is largest.
 
-    Largest over random joint values, not over measured ones: what an extension may do does not depend on the data. One
-    that moves nothing, the compliance of a vertical axis for instance, has the usual size of its kind.
+    The largest over random joint values, not measured ones: the prior does not depend on the data. An extension without
+    any deflection, such as the compliance of a vertical axis, has the default scale of its kind.
     """
     q = _draws(robot)
     torques = np.abs(gravity_torques(robot, q)).max(axis=0)

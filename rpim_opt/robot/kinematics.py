@@ -1,7 +1,7 @@
 """Symbolic kinematics in CasADi: homogeneous transforms, the MDH chain, frames; and functions at many rows.
 
-Functions of symbols take and return CasADi ``SX`` (numbers are welcome) and build 4 x 4 matrices, or the factors whose
-`product` they are.
+Functions of symbols take and return CasADi ``SX`` (or numbers); they return 4 x 4 matrices, or the factors of a
+`product`.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ FRAME = ("x", "y", "z", "rx", "ry", "rz")
 FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True))
 
 EYE = ca.DM(np.eye(4))  # dense, as all transforms are
-WIDTH = 256  # rows of one call: in the virtual machine their numbers stay in the processor's second cache
-SHARE = 16 * WIDTH  # rows that one thread evaluates before it takes more: enough to be worth handing over
-PAYS = 1_000  # rows from which a vectorized function pays: to build it takes as long as to evaluate twice as many
+WIDTH = 256  # rows of one call: the virtual machine's numbers then fit into the second-level cache
+SHARE = 16 * WIDTH  # rows that a thread evaluates per task: enough to outweigh the handover
+PAYS = 1_000  # rows from which a vectorized function pays: building it costs as much as evaluating twice as many
 
 
 def rotation(axis: int, angle: Symbol) -> ca.SX:
@@ -69,7 +69,7 @@ LINK = ca.Function("link", _numbers, [ca.densify(product(link(*_numbers)))])
 
 def roll_pitch_yaw(R: Array) -> Array:
     """Return (rx, ry, rz) [rad] with R = Rz Ry Rx."""
-    # roll is read off what yaw leaves: at a pitch of 90 degrees the three give R back, too
+    # roll is computed with yaw removed: the three angles give R back also at a pitch of 90 degrees
     yaw = np.arctan2(R[1, 0], R[0, 0]) if np.hypot(R[1, 0], R[0, 0]) > 1e-12 else np.arctan2(-R[0, 1], R[1, 1])
     c, s = np.cos(yaw), np.sin(yaw)
     roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
@@ -88,7 +88,7 @@ def placed(nominal: Sequence[Symbol], deviation: Sequence[Symbol] = (0,) * 6) ->
 
         origin = nominal origin + (x, y, z),    R = R(rx, ry, rz) R(nominal)
 
-    which is regular wherever the nominal frame points: adding to roll, pitch and yaw would be singular at 90 degrees.
+    which is regular for every nominal frame, while adding to roll, pitch and yaw is singular at a pitch of 90 degrees.
     """
     origin = [n + d for n, d in zip(nominal[:3], deviation[:3], strict=True)]
     turns = [rotation(axis, angles[axis]) for angles in (deviation[3:], nominal[3:]) for axis in (2, 1, 0)]
@@ -174,9 +174,9 @@ def _flange(joint_types: tuple[str, ...]) -> ca.Function:
 
 
 def forward_kinematics(robot: Robot, q: Array) -> Array:
-    """Return the transforms (N, 4, 4) from the robot's base to its flange, the product of the links of `Robot`.
+    """Return the transforms (N, 4, 4) from the robot's base to its flange, without base and tool frame.
 
-    At joint values q (N, dof) of the controller [rad or m]; base and tool are no part of it.
+    Each is the product of the links of `Robot` at the controller's joint values q (N, dof) [rad or m].
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -196,9 +196,9 @@ def forward_kinematics(robot: Robot, q: Array) -> Array:
 def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
     """Evaluate a CasADi function of shared vectors and a row on every row (N, k) of a table, on all cores.
 
-    Returned are its outputs, dense ones (r, c) as (N, c, r). CasADi's virtual machine spends most of its time between
-    operations: for many rows a function of scalars is rebuilt so that every operation is done on `WIDTH` of them at
-    once. Operations and their order stay, and with them every bit of the values.
+    Return its outputs, a dense one of (r, c) as (N, c, r). CasADi's virtual machine spends most of its time between
+    operations: for many rows the function is rebuilt so that every operation works on `WIDTH` rows at once. Operations
+    and their order do not change, and the values agree to the last bit.
     """
     results = [np.zeros((len(rows), *reversed(function.size_out(i)))) for i in range(function.n_out())]
     arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]

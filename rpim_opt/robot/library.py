@@ -55,7 +55,7 @@ def read_arm(
 ) -> RobotSetup:
     """Return the robot of a file, with base and tool if a URDF or a standard DH table states them.
 
-    A table has ``units`` as `TableOptions` where it states none.
+    ``units`` (as in `TableOptions`) hold where a table states none.
     """
     if file.suffix == ".urdf":
         from rpim_opt.robot.formats.urdf import read_urdf

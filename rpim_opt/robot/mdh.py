@@ -18,8 +18,8 @@ from rpim_opt.robot.terms import Model
 MDH = ("alpha", "a", "theta", "d", "beta")
 """Columns of the table, in this order: Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)."""
 MDH_DIMENSION = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length", "beta": "angle"}
-FARTHEST = 1e15  # size [m or rad] of a table's numbers: common normals of axes that are nearly parallel may be far away
-STANDARD = 9.80665  # acceleration of free fall [m/s^2]
+FARTHEST = 1e15  # largest number of a table [m or rad]: common normals of nearly parallel axes may be far away
+STANDARD = 9.80665  # standard acceleration of free fall [m/s^2]
 Vector = tuple[float, float, float]
 MOUNTINGS: dict[str, Vector] = {"floor": (0.0, 0.0, -1.0), "ceiling": (0.0, 0.0, 1.0), "wall": (-1.0, 0.0, 0.0)}
 """Where gravity points in the robot's base; on a wall the base's x axis points up."""
@@ -29,12 +29,12 @@ MOUNTINGS: dict[str, Vector] = {"floor": (0.0, 0.0, -1.0), "ceiling": (0.0, 0.0,
 class Gravity:
     """Gravity on a robot.
 
-    ``direction`` is where it points in the robot's base frame (frame 0 of the table), made a unit vector. ``masses``
-    are those of the links that joints 1 to dof move [kg], ``centres`` where they are in the links' own frames [m], the
-    frames after these joints. Without: a guess, 5 kg at the last frame's origin and 10 kg at frame 4's, which is good
-    enough for how torques depend on the configuration: compliance takes up their size. ``payload`` is what the flange
-    carries besides [kg], ``payload_centre`` where, in the flange frame [m]. InputError for no direction, masses that
-    are negative, numbers that are not finite or do not fit together.
+    ``direction`` is that of gravity in the robot's base frame (frame 0 of the table), normalized to a unit vector.
+    ``masses`` are those of links 1 to dof [kg], ``centres`` their centres of mass in the link frames (frame i follows
+    joint i) [m]. Without masses, 5 kg at the origin of the last frame and 10 kg at that of frame 4 are assumed:
+    compliance absorbs the size of a torque, and only its dependence on the configuration matters. ``payload`` [kg] is
+    an additional mass at ``payload_centre`` [m] in the flange frame. InputError for a zero direction, negative masses,
+    and numbers that are not finite or do not fit together.
 
     >>> import rpim_opt as ro
     >>> ro.robot.Gravity(direction=(0, 0, -9.81), payload=2.5).direction
@@ -62,8 +62,8 @@ class Gravity:
     def mounted(self, mounting: str | Sequence[float], base: ArrayLike | None = None) -> Gravity:
         """Return the same masses on a robot mounted on "floor", "ceiling" or "wall", or with a gravity direction (3,).
 
-        The base's x axis points up on a wall. ``base`` (3, 3) is the rotation of frame 0 of the table in the base that
-        is meant, a URDF's root link for instance.
+        On a wall the base's x axis points up. ``base`` (3, 3) rotates frame 0 of the table into the base to which the
+        mounting refers, a URDF's root link for instance.
         """
         if isinstance(mounting, str):
             if mounting not in MOUNTINGS:
@@ -110,16 +110,16 @@ class Robot(Brief):
         Rot(x, alpha) Trans(x, a) Rot(z, theta + q) Trans(z, d) Rot(y, beta)      revolute
         Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d + q) Rot(y, beta)      prismatic
 
-    where q are the joint values of the model, ``joint_map @ (joint values of the controller)``.
+    where q are the model's joint values, q = ``joint_map`` @ (joint values of the controller).
 
-    ``mdh`` is (n, 5), columns alpha [rad], a [m], theta [rad], d [m], beta [rad]; ``joint_types`` are ``"revolute"`` or
-    ``"prismatic"`` of every joint, all revolute by default. ``joint_map`` (n, dof) holds signs and couplings between
-    the controller's joint values and the model's, the identity by default (a FANUC counts joint 3 from the horizontal);
-    mimic joints have a row and no column: dof is less than n then. ``limits`` (dof, 2) are lower and upper joint values
-    of the controller [rad or m], infinite where unknown; ``source`` is the origin of the table. ``model`` are
-    terms of a user's own, by which it moves besides; `forward_kinematics` is of the table alone. ``joint_names`` are
-    what a file calls the joints. InputError for shapes that do not fit, numbers that are not finite, a singular joint
-    map, limits that are not in order, masses or names that are not one per joint.
+    ``mdh`` is (n, 5) with columns alpha [rad], a [m], theta [rad], d [m], beta [rad]; ``joint_types`` states
+    ``"revolute"`` (default) or ``"prismatic"`` for every joint. ``joint_map`` (n, dof) has the signs and couplings
+    between the controller's joint values and the model's, by default the identity (a FANUC counts joint 3 from the
+    horizontal); a mimic joint has a row but no column, so that dof < n. ``limits`` (dof, 2) are lower and upper joint
+    values of the controller [rad or m], infinite if unknown; ``source`` is the origin of the table. ``model`` adds
+    user-defined terms, which `forward_kinematics` leaves out. ``joint_names`` are the names in a robot's file.
+    InputError for shapes that do not fit, numbers that are not finite, a singular joint map, limits that are not in
+    order, and masses or names that are not one per joint.
 
     >>> import numpy as np
     >>> import rpim_opt as ro

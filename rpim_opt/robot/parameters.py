@@ -21,8 +21,8 @@ from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, Robot
 from rpim_opt.robot.terms import JOINT_TERMS, MOMENT_SCALE, Entry, Model
 
 EXPANSION, REFERENCE = "expansion", "reference_temperature"
-"""By how much all lengths of a robot grow with temperature, and the temperature at which they are nominal."""
-JOINT_OFFSET = "joint_offset"  # stands in tables for every theta
+"""Relative expansion of all lengths per kelvin, and the temperature at which they are nominal."""
+JOINT_OFFSET = "joint_offset"  # in tables: every theta
 DEFAULT_SCALE = {
     ("length", "length"): 1e-3, ("angle", "angle"): 1e-3,
     ("tool", "length"): 10e-3, ("tool", "angle"): 10e-3,
@@ -31,7 +31,7 @@ DEFAULT_SCALE = {
     ("camera", "pixel"): 10.0, ("camera", "ratio"): 1e-3, ("camera", ""): 0.05,
 }  # fmt: skip
 """Default prior scales of deviations by (group, dimension) [SI]; terms state their own."""
-STEEL = 12e-6  # by how much steel grows [1/K]; aluminium by 23e-6
+STEEL = 12e-6  # thermal expansion of steel [1/K]; aluminium has 23e-6
 SHOWN = 4  # names in one line
 NUMBERS = ("nominal", "scale", "tolerance", "identified")  # fields of `Parameters` that are arrays
 _TABLE = re.compile(rf"({'|'.join(MDH)})\d+")
@@ -107,12 +107,12 @@ def known_patterns(names: Sequence[str], pattern: str) -> str:
 class Parameters(Tabled):
     """A table of model parameters, one entry each in every field.
 
-    ``names`` are ``alpha1, a1, theta1, d1, beta1, alpha2, ..., base_x, ..., base_rz, tool_x, ..., tool_rz`` (of several
-    reflectors ``tool_A_x, ...``) and those of the measurement; ``dimensions`` ``length``, ``angle``, ``ratio`` or
-    ``compliance``. ``nominal`` (P,) are the values from which deviations count, ``scale`` (P,) their prior standard
-    deviations, ``tolerance`` (P,) the largest deviations that a bounded calibration allows, or infinite [SI];
-    ``identified`` (P,) marks those that a calibration changes. ``own_frames`` are prefixes of measurements' frames,
-    ``plane_``, ``terms`` names of the parameters of a user's own terms (`Model`).
+    ``names`` are ``alpha1, a1, theta1, d1, beta1, alpha2, ..., base_x, ..., base_rz, tool_x, ..., tool_rz`` (with
+    several reflectors ``tool_A_x, ...``) and the measurement's own; ``dimensions`` are ``length``, ``angle``, ``ratio``
+    or ``compliance``. ``nominal`` (P,) are nominal values, ``scale`` (P,) prior standard deviations of the deviations,
+    ``tolerance`` (P,) their bounds in a bounded calibration, or infinite, all in SI units; ``identified`` (P,) marks
+    the parameters that a calibration changes. ``own_frames`` are prefixes of frames of the measurement, such as
+    ``plane_``, ``terms`` the parameters of user-defined terms (`Model`).
 
     >>> import rpim_opt as ro
     >>> parameters = ro.load("position").problem.parameters
@@ -122,7 +122,7 @@ class Parameters(Tabled):
     >>> few.groups, few.periodic, few.of_frames
     (('angle', 'length', 'angle', 'tool'), array([ True, False, False,  True]), array([False, False, False,  True]))
 
-    Parameters of several robots bear the robot's name unless they are shared:
+    For several robots, parameters that are not shared have the robot's name as prefix:
 
     >>> problem = ro.load("position").problem
     >>> both = ro.together(left=problem, right=problem, shared=["tool_*"]).parameters
@@ -153,7 +153,7 @@ class Parameters(Tabled):
         """Return name, unit, and in it the figures (P,) [SI] of every parameter; None for infinite ones."""
         rows: list[dict[str, Any]] = []
         for i, (name, dimension) in enumerate(zip(self.names, self.dimensions, strict=True)):
-            # a joint's deflection under gravity, as compliances state it
+            # stated as the deflection of a joint under gravity
             unit, si = ("mrad", 1e-3) if own_name(name).startswith("moment") else display(dimension)
             figures = {column: float(values[i] / si) for column, values in columns.items()}
             known = {column: value if np.isfinite(value) else None for column, value in figures.items()}
@@ -238,10 +238,10 @@ class Parameters(Tabled):
         return x - 2 * np.pi * np.where(self.periodic, turns, 0.0)
 
     def identify(self, patterns: str | Iterable[str]) -> Parameters:
-        """Return the same table with just the parameters identified that match the pattern, or one of several.
+        """Return the same table with the parameters identified that match one of the patterns, and no others.
 
-        A pattern is a name with ``*``, ``?`` and ``[...]`` as in file names: ``"a?"``, ``"beta[34]"``. InputError for
-        one that matches no parameter.
+        A pattern is a name with ``*``, ``?`` and ``[...]`` as for file names: ``"a?"``, ``"beta[34]"``. InputError for
+        a pattern without a match.
 
         >>> import rpim_opt as ro
         >>> parameters = ro.load("position").problem.parameters
@@ -259,8 +259,8 @@ class Parameters(Tabled):
     def values(self, x: Array) -> Array:
         """Return the parameters' values (n,) [SI] at deviations x (n,) [SI], one for every entry of the table.
 
-        A sum, except for the roll, pitch and yaw of a frame, whose deviation is a rotation about the
-        parent's axes (`kinematics.frame`): there the angles of the composed rotation.
+        The sum of nominal value and deviation, except for roll, pitch and yaw of a frame: their deviation is a rotation
+        about the parent's axes (`kinematics.frame`), their values are the angles of the composed rotation.
         """
         result = self.nominal + x
         for angles in self._orientations():
@@ -279,7 +279,7 @@ class Parameters(Tabled):
     def slopes(self) -> Array:
         """Return the derivatives (n, n) of `values` by deviations, at zero.
 
-        The identity, but for roll, pitch and yaw, by which a frame turns about Rz Ry e_x, Rz e_y and e_z.
+        The identity, except for roll, pitch and yaw, which rotate a frame about Rz Ry e_x, Rz e_y and e_z.
         """
         result = np.eye(len(self))
         for angles in self._orientations():
@@ -303,9 +303,9 @@ class Parameters(Tabled):
         """Return the same table with other scales, stated as in a problem file's ``[scale]``.
 
         Keys are ``length_mm``, ``angle_mrad``, ``tool_mm``, ``base_mrad``, ... for a group, ``joint_offset_mrad`` for
-        every theta, or a pattern or a parameter's name with a unit, ``a?_mm``, ``d5_mm``. A name goes before a pattern,
-        a pattern before a group. Unknown keys, missing or wrong units, and values that are not positive are refused; an
-        error names ``file``.
+        every theta, or a parameter's name or a pattern with a unit, ``d5_mm``, ``a?_mm``. A name has precedence over a
+        pattern, a pattern over a group. InputError (naming ``file``) for unknown keys, missing or wrong units, and
+        values that are not positive.
 
         >>> import rpim_opt as ro
         >>> parameters = ro.load("position").problem.parameters.scaled({"length_mm": 0.2, "a3_mm": 2.0})
@@ -327,12 +327,12 @@ def overlay(
     signed: bool = False,
     file: object = None,
 ) -> Array:
-    """Return values (P,) [SI] with those of a table (keys as in `Parameters.scaled`) in their places.
+    """Return values (P,) [SI], replaced where a table states others (keys as in `Parameters.scaled`).
 
-    What names fewer parameters goes before. ``where`` and ``file`` are named in errors; ``signed``: whether zero and
-    negative values are accepted.
+    A name has precedence over a pattern, a pattern over a group. Errors name ``where`` and ``file``; ``signed`` is
+    whether zero and negative values are accepted.
     """
-    members: dict[str, list[int]] = {}  # whom keys may mean: groups, joint offsets, patterns of the table, names
+    members: dict[str, list[int]] = {}  # parameters by key: groups, joint offsets, patterns of the table, names
     for i, group in enumerate(parameters.groups):
         members.setdefault(group, []).append(i)
     offsets = [i for i, name in enumerate(parameters.names) if is_joint_offset(name)]
@@ -376,11 +376,11 @@ def model_parameters(
 ) -> Parameters:
     """Return every parameter of a model, none of them identified yet, with `DEFAULT_SCALE` and without tolerances.
 
-    ``base`` (6,) is the robot's in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; ``tools`` are
-    reflectors in the flange frame by marker, (6,) each as the base, ``{"": frame}`` for the only one. ``own`` are the
-    measurement's parameters, name to (dimension, nominal value [SI]), ``own_frames`` prefixes of those that are frames,
-    ``plane_``. ``sessions`` are names of sessions, by which the base is shifted and turned besides. Lengths are nominal
-    at a ``temperature`` [K], where it is known, and grow by ``expansion`` a kelvin.
+    ``base`` (6,) is the robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; ``tools`` are the
+    reflectors' frames (6,) in the flange frame by marker, ``{"": frame}`` for a single one. ``own`` maps the
+    measurement's parameters to (dimension, nominal value [SI]), ``own_frames`` are prefixes of those that are frames,
+    ``plane_``. Each of the ``sessions`` adds a session offset (shift and rotation of the base). If a ``temperature``
+    [K] is given, lengths are nominal there and grow by ``expansion`` per kelvin.
 
     >>> import rpim_opt as ro
     >>> robot = ro.load("paper_arm").problem.robot

@@ -22,10 +22,10 @@ Place = Literal["joint", "link", "base", "tool"]
 _STEM = re.compile(r"(?!base_|tool_)[A-Za-z](\w*[A-Za-z_])?(\{\}\w+)?")
 _FRAME = re.compile(r"\w*_r[xyz]")
 SIZES: dict[Place, int] = {"joint": 1, "link": 6, "base": 6, "tool": 6}  # how many numbers a term returns
-ENDS = ("base", "tool")  # places that an arm has once: parameters there have no number
-EXPECTED_WAVE = 1e-5  # scale of one harmonic of a transmission error before it is estimated [rad]
+ENDS = ("base", "tool")  # places that exist once in an arm: their parameters have no number
+EXPECTED_WAVE = 1e-5  # prior scale of one harmonic of a transmission error before it is estimated [rad]
 SOMEWHERE, ROUNDING = 0.5, 1e-12
-"""Value [SI] of whatever a term sees where its motion with all parameters zero is evaluated, and what may be left."""
+"""Value [SI] of a term's inputs where its motion is evaluated with all parameters zero, and the tolerance of zero."""
 MOMENT_SCALE = 1e-4  # prior standard deviation of a joint's deflection by one component of a link's first moment [rad]
 
 
@@ -55,16 +55,16 @@ class Weight:
 class Configuration:
     """State of an arm in one configuration."""
 
-    q: Sequence[Symbol]  # of the model [rad or m]
-    torque: Sequence[Symbol] | None = None  # measured [Nm]; None where those of gravity stand for them
-    approach: Sequence[Symbol] | None = None  # directions of the last movement, -1, 0 or +1; None where not known
+    q: Sequence[Symbol]  # joint values of the model [rad or m]
+    torque: Sequence[Symbol] | None = None  # measured [Nm]; None: those of gravity are used
+    approach: Sequence[Symbol] | None = None  # directions of the last movement, -1, 0 or +1; None if unknown
     weight: Weight = field(default_factory=Weight)  # gravity; none by default
     columns: Mapping[str, Symbol] = field(default_factory=dict)  # further columns of the data by name [SI]
 
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """Argument of a term: joint ``number`` (from 1) and its link; the first for the base, the last for the tool.
+    """Argument of a term: joint ``number`` (from 1) and its link; for the base the first, for the tool the last joint.
 
     >>> import rpim_opt as ro
     >>> at = ro.robot.Configuration(q=[0.1, 0.5], torque=[3.0, 7.0], approach=[-1, 1], columns={"hours": 8.0})
@@ -138,20 +138,19 @@ class Entry(NamedTuple):
 class Term:
     """A motion of an arm in addition to its joint values.
 
-    ``moves(joint, *parameters)`` is in CasADi, from what it sees (`Joint`) and the parameters in the order of
-    ``scales``. Of a joint (``at`` is ``"joint"``, ``"link"``, ``"base"`` or ``"tool"``) it returns by how much it moves
-    further [rad or m]. Of a link, of the base or of the tool: six numbers x, y, z [m], rx, ry, rz [rad], by which the
-    frame behind the link, the robot's or the flange's, is displaced along and about its own axes. Small terms of a link
-    add up. A term whose parameters are all zero must not move anything; it is not evaluated then.
+    ``moves(joint, *parameters)`` is written in CasADi; it gets a `Joint` and the parameters in the order of ``scales``.
+    For ``at="joint"`` it returns an additional joint motion [rad or m]. For ``"link"``, ``"base"`` or ``"tool"`` it
+    returns six numbers x, y, z [m], rx, ry, rz [rad]: a displacement, along and about its own axes, of the frame behind
+    the link, of the robot's base or of the flange. Small terms of one link add up. With all parameters zero a term must
+    not move anything; it is not evaluated then.
 
-    ``scales`` are the parameters by name, with their unit and prior scale: ``{"play_mrad": 0.1}``. Every joint or
-    link has its own, ``play2``; ``{}`` in a name stands for the number. ``nominal`` are their nominal values, with the
-    same keys, zero by default. ``joints`` are numbers (from 1) or types (``"revolute"``, ``"prismatic"``) of the joints
-    or links that have it, by default the revolute joints, and all links. ``columns`` are further columns of the data
-    that it sees, name to dimension: ``{"temperature": "temperature"}`` stands for a column ``temperature_K``,
-    ``{"hours": ""}`` for one without unit. ``made_of`` is of this package's terms that follow from numbers alone, which
-    a file holds: `Curve`, `chain.RowOrigins`. InputError for names, units, scales, places and dimensions that cannot
-    be.
+    ``scales`` maps parameters, named with their unit, to prior scales: ``{"play_mrad": 0.1}``. Every joint or link has
+    its own, ``play2``; ``{}`` in a name stands for the number. ``nominal`` are nominal values with the same keys, zero
+    by default. ``joints`` are numbers (from 1) or types (``"revolute"``, ``"prismatic"``) of the joints or links that
+    have the term; by default revolute joints, or all links. ``columns`` maps further columns of the data to dimensions:
+    ``{"temperature": "temperature"}`` is a column ``temperature_K``, ``{"hours": ""}`` one without unit. ``made_of`` is
+    set by this package for terms that can be stored as numbers: `Curve`, `chain.RowOrigins`. InputError for invalid
+    names, units, scales, places and dimensions.
 
     >>> import casadi as ca
     >>> import rpim_opt as ro
@@ -247,12 +246,12 @@ def require_columns(columns: Mapping[str, str], where: str) -> None:
 def term_motion(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | None:
     """Return the motion of a term, (1, 1) or (6, 1); None if its parameters are all zero."""
     sizes = [value(name) for name in term.names(joint.number)]
-    # an effect may take a whole chain to write down: not for a parameter that is not there
+    # building an effect may need the whole chain: skipped without its parameter
     if sizes and all(ca.SX(size).is_zero() for size in sizes):
         return None
     try:
         moves = term.moves(joint, *sizes)
-    except (AttributeError, TypeError, RuntimeError) as error:  # an `if` of a symbol is a RuntimeError
+    except (AttributeError, TypeError, RuntimeError) as error:  # a Python `if` of a symbol raises RuntimeError
         accepted = f"moves({', '.join([term.at, *(entry.name for entry in term.entries)])}) using only what `Joint` has"
         accepted += " and functions of CasADi (ca.if_else)"
         raise InputError(f"term '{term.name}'", f"{type(error).__name__}: {error}", accepted) from error
@@ -279,7 +278,7 @@ class Curve(NamedTuple):
     """Where the transmission error of a joint is a Fourier series: `transmission` is the term."""
 
     joint: int  # from 1
-    centre: float  # of the angles [rad]
+    centre: float  # angle [rad] about which the series is centred
     period: float  # [rad]
     harmonics: int
 
@@ -299,8 +298,8 @@ def transmission(curve: Curve) -> Term:
         u_k = k (q - centre)                                                                for k <= waves
         u_k = (k - waves) 2 pi clip(q - centre, -period / 2, period / 2) / period           for harmonics more
 
-    Parameters ``transmission{joint}_c{k}`` and ``..._s{k}``. The period is longer than the range that was measured, so
-    that only waves, which are longer still, go on beyond it.
+    Parameters ``transmission{joint}_c{k}`` and ``..._s{k}``. The period exceeds the measured range, and beyond it only
+    the waves continue, which are longer.
 
     >>> import math
     >>> import rpim_opt as ro
@@ -330,10 +329,10 @@ def _series(curve: Curve, joint: Joint, *sizes: Symbol) -> Symbol:
 class Model:
     """The kinematic model of an arm: the product of its links, with user-defined terms.
 
-    ``terms`` move joints, links, the base or the tool besides those that every arm has (``ratio``, ``ecc_cos``, ...,
+    ``terms`` move joints, links, the base or the tool in addition to the built-in terms (``ratio``, ``ecc_cos``, ...,
     ``compliance``, ``backlash``, ``bend``); two parameters of one name, or one column in two dimensions, are refused.
 
-    A tool that drifts with the hours of a column of the data:
+    A tool that drifts with the column ``hours`` of the data:
 
     >>> import rpim_opt as ro
     >>> drift = lambda tool, rate: [0, 0, rate * tool.column("hours"), 0, 0, 0]
@@ -346,7 +345,7 @@ class Model:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "terms", tuple(self.terms))
-        own = [term for term in self.terms if not isinstance(term.made_of, Curve)]  # those are one a joint
+        own = [term for term in self.terms if not isinstance(term.made_of, Curve)]  # curves exist once per joint
         stems = [entry.name for term in own for entry in term.entries]
         for stem in stems:
             if stems.count(stem) > 1:
@@ -394,7 +393,7 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
         moves = ca.SX(0, 1)
         for term in model.terms:
             if isinstance(term.made_of, Curve):
-                continue  # of its own joint's angle, and long to write down
+                continue  # depends on its own joint's angle alone, and is long to write down
             seen = {name: columns[name] for name in term.columns}
             configuration = Configuration(ca.vertsplit(q), ca.vertsplit(torque), ca.vertsplit(approach), gravity, seen)
             for i in term.places(joint_types):

@@ -29,12 +29,12 @@ INTRINSICS = {
 STRETCH = {"stretch_x": "ratio", "stretch_y": "ratio"}
 """Relative stretch of a printed board against its file, along its axes."""
 TARGET = {"target_x": "length", "target_y": "length", "target_z": "length"}
-"""Columns: where a row's point is on its board."""
+"""Columns with the coordinates of a row's point on its board."""
 Board = Mapping[str, Sequence[float] | Array]
-"""Where points are on their board, (3,) each [m], by name."""
+"""Positions (3,) [m] of points on their board, by name."""
 LEAST = 2
 MOST = 300
-"""Points along either side of a pattern: beyond the larger number none has them, and they are listed one by one."""
+"""Points along either side of a pattern; a larger board is stated as a table of its points."""
 
 
 def pixels(point: Iterable[Any], camera: Mapping[str, Any]) -> tuple[Any, Any]:
@@ -101,8 +101,8 @@ eye_in_hand = Measurement(
     turning=True,
     metres=partial(_metres_of, False),
 )
-"""A point of a board that stands in the cell, seen by a camera on the flange: r = (u, v) - pixels(T^-1 p), T the camera
-in the board's frame, which is the instrument's."""
+"""A point of a fixed board, seen by a camera on the flange: r = (u, v) - pixels(T^-1 p), with T the camera in the
+board's frame, which is the instrument's."""
 
 eye_to_hand = replace(
     eye_in_hand,
@@ -111,8 +111,8 @@ eye_to_hand = replace(
     metres=partial(_metres_of, True),
     words=_WORDS._replace(target="a board", at_flange="The board", frame="in the frame of the camera"),
 )
-"""A point of a board on the flange, seen by a camera beside the robot: r = (u, v) - pixels(T p), T the board in the
-camera's frame, which is the instrument's."""
+"""A point of a board on the flange, seen by a fixed camera: r = (u, v) - pixels(T p), with T the board in the camera's
+frame, which is the instrument's."""
 
 TYPES = (eye_in_hand, eye_to_hand)
 CAMERAS = {m.name: m for m in TYPES}
@@ -121,7 +121,7 @@ CAMERAS = {m.name: m for m in TYPES}
 def grid_board(columns: int, rows: int, spacing: float) -> dict[str, Array]:
     """Return the points (3,) of a chessboard or a grid of circles, numbered from 0 row by row as OpenCV finds them.
 
-    ``columns`` and ``rows`` are inner corners along x and along y, ``spacing`` is from one to the next [m].
+    ``columns`` and ``rows`` are the numbers of inner corners along x and y, ``spacing`` their distance [m].
 
     >>> import rpim_opt as ro
     >>> board = ro.data.grid_board(9, 6, 0.025)
@@ -161,9 +161,9 @@ def read_board(source: Any) -> dict[str, Array]:
 def views(q: Array, board: Board, uv: Array, sigma: float | Array, measurement: str = "eye_in_hand") -> Dataset:
     """Return the dataset of a camera's views of a board's P points at joint values q (V, dof) [rad or m].
 
-    The points appear at ``uv`` (V, P, 2) [px], NaN for those that were not found; ``sigma`` is one standard deviation
-    [px], or the covariance of u and v, (2, 2) or (V, P, 2, 2) [px^2]; ``measurement`` is ``"eye_to_hand"`` where the
-    robot carries the board. InputError for shapes that do not fit together, and a measurement that is no camera's.
+    ``uv`` (V, P, 2) are the points' image coordinates [px], NaN if a point was not found; ``sigma`` is one standard
+    deviation [px], or the covariance of u and v, (2, 2) or (V, P, 2, 2) [px^2]; ``measurement`` is ``"eye_to_hand"`` if
+    the robot carries the board. InputError for shapes that do not fit together, and other measurement types.
 
     >>> import numpy as np
     >>> import rpim_opt as ro

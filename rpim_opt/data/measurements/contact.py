@@ -17,7 +17,7 @@ from rpim_opt.data.measurements.distance import distance
 from rpim_opt.data.measurements.measurement import XYZ, Measurement, Words, origin
 
 COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
-"""In the name of a column that holds a measured coordinate."""
+"""Coordinate in the name of a column that holds measured values."""
 TOUCHED = ("point", "plane")  # columns that name the touched point or plane
 
 
@@ -45,12 +45,12 @@ revisit_plane = Measurement(
         columns={"point": "touched point", "plane": "touched plane"},
     ),
 )
-"""A touch of an unmeasured plane: r_i = n'(c - p_i), with n and c those of the plane that fits best."""
+"""A touch of an unmeasured plane: r_i = n'(c - p_i), with n and c normal and centre of the best-fitting plane."""
 
 revisit = replace(
     revisit_plane, name="revisit", planar=False, variants={"plane": revisit_plane}, shown_by=names_touches
 )
-"""A touch of an unmeasured point: r_i = c - p_i, with c the mean of the positions of all touches of it."""
+"""A touch of an unmeasured point: r_i = c - p_i, with c the mean position of all its touches."""
 
 known_distance = replace(distance, name="known_distance")
 """The known distance between two touched points or parallel planes: r = y - |c2 - c1|."""
@@ -58,7 +58,7 @@ known_distance = replace(distance, name="known_distance")
 known_square = Measurement(
     "known_square", lambda T1, T2: 0 * T1[0, 0], {"angle": "angle"}, noise={"angle": "angle"}, points=2
 )
-"""Two touched planes are at right angles: r = -asin(n1'n2)."""
+"""Two touched planes at right angles: r = -asin(n1'n2)."""
 
 known_parallel = Measurement(
     "known_parallel",
@@ -68,11 +68,11 @@ known_parallel = Measurement(
     noise={"angle": "angle"},
     points=2,
 )
-"""Two touched planes are parallel: r = -(t1'n2, t2'n2), with two directions t in the first."""
+"""Two parallel touched planes: r = -(t1'n2, t2'n2), with two directions t in the first plane."""
 
 TYPES = (revisit,)
 KNOWN = (known_distance, known_square, known_parallel)
-"""Known dimensions of touched objects: no measurements, though they have equations."""
+"""Known dimensions of touched objects: constraints in the form of measurement types."""
 UNNAMED = (revisit_plane, *KNOWN)  # ready types that no problem file names as its measurement
 
 
@@ -80,7 +80,7 @@ UNNAMED = (revisit_plane, *KNOWN)  # ready types that no problem file names as i
 class KnownDistance:
     """Known distance between two touched points or two parallel touched planes.
 
-    ``between`` are their names, ``value`` [m] is greater than zero, ``sigma`` is its standard deviation [m].
+    ``between`` are the two names, ``value`` > 0 is the distance [m], ``sigma`` its standard deviation [m].
     """
 
     between: tuple[str, str]
@@ -98,8 +98,8 @@ class KnownDistance:
 class KnownAngle:
     """Known angle between two touched planes: parallel or perpendicular.
 
-    ``between`` are their names, ``sigma`` is the standard deviation of the angle [rad]; ``value`` is by how much the
-    angle differs from 0 or 90 degrees.
+    ``between`` are the two names, ``sigma`` is the standard deviation of the angle [rad], ``value`` the deviation of
+    the angle from 0 or 90 degrees [rad].
     """
 
     between: tuple[str, str]
@@ -130,8 +130,8 @@ def _require_sound(known: Known) -> None:
 def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
     """Return the measurements with rows added for known distances and angles.
 
-    Points that a distance joins belong together from then on: cross-validation leaves out all of them or none. Names
-    that no row touches are refused, and points where planes are wanted.
+    Points joined by a distance then belong together: cross-validation leaves out all or none of their rows. InputError
+    for names that no row touches, and for points where planes are required.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -156,7 +156,7 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
         if len(planar) > 1 or (each.measurement is not known_distance and planar == {False}):
             accepted = "two planes, or two points for a distance"
             raise InputError(where, f"between '{each.between[0]}' and '{each.between[1]}'", accepted)
-        # the row's joint values are those of a touch of either; it is of one robot, where the two are all touches say
+        # the row has the joint values of one touch of either, and a robot if all touches of both are by it
         if second.robot != first.robot:
             first = second
         stated: dict[str, Any] = {"payload": first.payload}
@@ -178,7 +178,7 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
 def touches(q: Array, point: Sequence[str], sigma: float | Array, planes: bool = False) -> Dataset:
     """Return touches of unmeasured points or planes at joint values q (N, dof) of the controller [rad or m].
 
-    Rows with the same one of N names touched the same ``point``, or the same plane if ``planes``; ``sigma`` is the
+    ``point`` are N names: equal names are touches of one point, or of one plane if ``planes``. ``sigma`` is the
     standard deviation of a touch [m], or covariances (3, 3) or (N, 3, 3) [m^2].
 
     >>> import numpy as np

@@ -18,7 +18,7 @@ DISTANCE = {"distance": "length"}
 def _centred(points: Array, y: Array, what: str) -> tuple[Array, Array]:
     """Return the points' mean m (3,), and the unknowns of |p - m - c| = y - l or R: c (3,), l if measured, R^2 - |c|^2.
 
-    In these the squares are linear, with R = l of an anchor. Refused are points that do not determine them.
+    The squared equations are linear in them (for an anchor, R = l). InputError if the points do not determine them.
     """
     middle = points.mean(axis=0)
     p = points - middle
@@ -79,7 +79,7 @@ plane = Measurement(
     frames=("plane",),
     start=plane_start,
 )
-"""A point on a plane, stated as a frame whose x and y axes span it: r = -n'(p - o) with its z axis n and origin o."""
+"""A point on a plane given by a frame with origin o and z axis n, the normal: r = -n'(p - o)."""
 
 SPHERE: dict[str, str] = dict.fromkeys(("sphere_x", "sphere_y", "sphere_z", "sphere_r"), "length")
 sphere = Measurement(

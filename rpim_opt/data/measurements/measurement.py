@@ -1,6 +1,6 @@
 """Measurement types: columns and units, symbolic model, start values, noise, and wording.
 
-Every other module of this folder has one or several that are alike, which `registry` finds by its ``TYPES``.
+Every other module of this folder defines one or several similar types; `registry` finds them by ``TYPES``.
 """
 
 from __future__ import annotations
@@ -40,39 +40,37 @@ REFLECTOR = Words()
 class Measurement(Brief):
     """A measurement model: the residual of a row is ``minus(y, model(T, **own))``.
 
-    ``name`` is what a problem file calls it. ``model(*T, **own)`` are the modelled values (c, 1), from the transform T
-    (4 x 4) of the reflector in the instrument's frame, one for each of the ``points`` of the robot that a row involves
-    (2 for the distance between two), and the measurement's own ``parameters``, name to dimension; ``anchor_x`` is given
-    as ``x`` of a table ``[anchor]``. ``frames`` are the prefixes of those that are frames, six each: the model gets one
-    transform instead. It also gets what it ``depends_on``, by keyword: ``"q"`` for the model's joint values, (dof, 1),
-    of two points (dof, 2), ``"torque"`` for the measured joint torques in the same shape, and columns of the data by
-    name; ``extra`` has those columns, name to dimension, and ``accepted`` the text of the message where one is missing.
+    ``name`` is the name in problem files. ``model(*T, **own)`` returns the modelled values (c, 1). It gets a transform
+    T (4 x 4) of the reflector in the instrument's frame for each of the ``points`` of the robot that a row involves (2
+    for the distance between two), and the measurement's own ``parameters``, name to dimension; ``anchor_x`` is passed
+    as ``x`` of a table ``[anchor]``. ``frames`` are prefixes of parameters that form a frame, six each: the model gets
+    one transform instead. It also gets by keyword what it ``depends_on``: ``"q"`` are the model's joint values, (dof,
+    1), or of two points (dof, 2), ``"torque"`` the measured joint torques in the same shape, other names columns of the
+    data; ``extra`` maps those columns to dimensions, and ``accepted`` is the message if one is missing.
 
-    ``columns`` of a data table hold the measured values y, name to dimension: ``{"x": "length"}`` stands for a column
-    ``x_mm`` or ``x_m``; dimension ``""`` for one without unit; empty for a constraint, whose measured value is zero.
-    ``forms`` are other columns in which a table may state the values, each with the function to y (N, c); ``prepare``
-    checks and normalizes y (N, c), and raises `RowError` for a row that is wrong. ``components`` are those of the
-    residual, name to dimension, in order; the columns by default. Their names are the keys of the noise per axis
-    (``sigma_x_mm``, ``[noise] x_mm``). ``noise`` has the keys of the noise common to all components of a dimension:
-    ``{"position": "length"}`` stands for ``[noise] position_mm``; ``{"distance": "length"}`` by default.
+    ``columns`` are those of a data table with the measured values y, name to dimension: ``{"x": "length"}`` is a column
+    ``x_mm`` or ``x_m``, ``""`` the dimension of one without unit; without columns it is a constraint with measured
+    value zero. ``forms`` maps alternative columns to functions that compute y (N, c); ``prepare`` checks and normalizes
+    y (N, c), and raises `RowError` for an invalid row. ``components`` are the residual's, name to dimension, in order;
+    by default the columns. Their names are the keys of the noise per axis (``sigma_x_mm``, ``[noise] x_mm``). ``noise``
+    has the keys of the noise common to all components of a dimension: ``{"position": "length"}`` is ``[noise]
+    position_mm``; by default ``{"distance": "length"}``.
 
-    ``minus`` is measured minus modelled (k, 1), symbolic; ``plus`` its inverse on rows of numbers,
-    ``plus(modelled, e) = y`` with ``minus(y, modelled) = e``, for simulations; difference and sum by default.
-    ``start(points, y)`` are own parameters by name from nominal positions (N, 3) in the instrument's frame and measured
-    values (N, c), in closed form. ``metres(*T, **own)`` is how long a unit of the residual is at the thing that was
-    measured [m], for residuals that are no lengths: errors in millimetres are the residual times it. None for lengths
-    and angles.
+    ``minus`` is measured minus modelled (k, 1), symbolic; ``plus`` its inverse on rows of numbers, ``plus(modelled, e)
+    = y`` with ``minus(y, modelled) = e``, for simulations; by default difference and sum. ``start(points, y)`` returns
+    start values of own parameters by name, in closed form, from nominal positions (N, 3) in the instrument's frame and
+    measured values (N, c). ``metres(*T, **own)`` is the length of a unit of the residual at the measured object [m],
+    which converts residuals that are not lengths into errors in millimetres; None for lengths and angles.
 
-    A ``touching`` row states only which point was touched, a ``planar`` one which plane: its equations are
-    differences to the other rows of the point, in the robot's own base frame. ``names`` are columns of names that a
-    table of it may have besides, ``("point",)``, of which a touch has one; ``variants`` the type that it is where a
-    table has a column of that name; ``parts`` types of tables that state less and can validate it: positions of poses.
-    ``registers`` and ``turning`` say whether the base can be registered by rows in closed form, and whether rows tell
-    how the tool is turned.
-    ``shown_by(tables)`` is whether the columns of raw tables can only be of this type, before names are understood;
-    ``words`` are how readers hear of it.
+    A ``touching`` row states only which point was touched, a ``planar`` one which plane: its equations are differences
+    to the other rows of the point, in the robot's own base frame. ``names`` are optional columns of names,
+    ``("point",)``, of which a touch has one; ``variants`` maps such a column to the type of tables that have it;
+    ``parts`` are types of tables that measure less and can validate this one, such as positions for poses.
+    ``registers`` states whether rows register the base in closed form, ``turning`` whether they determine the tool's
+    orientation. ``shown_by(tables)`` returns whether the columns of raw tables can only be of this type, before names
+    are interpreted; ``words`` describe it in messages.
 
-    A probe that reads heights alone. On the nominal robot, residuals of such readings are zero.
+    A probe that measures heights only; on the nominal robot, residuals of such readings are zero:
 
     >>> import rpim_opt as ro
     >>> height = ro.data.Measurement("height", model=lambda T: T[2, 3], columns={"z": "length"})

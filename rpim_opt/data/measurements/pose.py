@@ -45,8 +45,8 @@ position = Measurement(
 def quaternion(T: Any) -> Any:
     """Return the unit quaternion (w, x, y, z), up to its sign, of a transform's rotation; regular everywhere.
 
-    The symmetric matrix 4 q q' is linear in the entries of R; its column with the largest diagonal entry,
-    normalized, is the quaternion and never shorter than 2 before (Shepperd 1978, J. Guidance and Control 1:223).
+    The symmetric matrix 4 q q' is linear in the entries of R; its column with the largest diagonal entry, normalized,
+    is the quaternion; before, its length is at least 2 (Shepperd 1978, J. Guidance and Control 1:223).
     """
     R = T[:3, :3]
     t = R[0, 0] + R[1, 1] + R[2, 2]

@@ -33,24 +33,24 @@ HALF_DAY = re.compile(r"(?i)(\d{1,2})(:\d\d.*?)\s*([ap])\.?m\.?")
 UNIT = re.compile(r"(.+?)[\s_]*[\[(/]?\s*\b(s|sec|secs|seconds|ms|us|µs|ns|nsec|nsecs)\b\s*[\])]?", re.IGNORECASE)
 SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "μs": 1e-6, "ns": 1e-9,
            "nsec": 1e-9, "nsecs": 1e-9}  # fmt: skip
-"""What a unit is in lower case (`str.casefold`)."""
+"""Seconds per unit, by its name in lower case (`str.casefold`)."""
 STAMP, NANOSECONDS = re.compile(r"(?i)(.*stamp[._/])secs?"), ("nsecs", "nsec", "nanosec")
-"""A time of ROS in two columns: its whole seconds, and endings of the other's name."""
+"""A ROS time in two columns: whole seconds, and endings of the other column's name."""
 COUNTER = re.compile(r"(?i)(.*[._/ ])?seq")
-"""What a publisher of ROS counts its own messages by: no key of two tables."""
+"""A ROS publisher's counter of its own messages: no key between two tables."""
 SAME = 0.8
-"""Share of the shorter one's values that two columns of other names have in common where they are one key."""
+"""Share of the shorter column's values that two differently named columns share if they are one key."""
 OTHER_KEYS = "--key row for rows in the same order, or --time-tolerance for the nearest time"
 SIMULTANEOUS = 0.01
-"""Times that differ by less than this part of the shortest time between rows are those of one row."""
+"""Times closer than this part of the shortest interval between rows are those of one row."""
 LOG, SMALL, MOVED = 2, 0.5, 0.01
-"""Rows of joints a measured one, or median step [deg] of a joint, of a log, and the change [deg] that is named."""
-PAUSE = 10  # usual steps of a log from which on it was not recorded
+"""A log has more rows of joints per measured one, or a smaller median joint step [deg]; a larger change is named."""
+PAUSE = 10  # multiple of the usual time step that counts as a gap in the log
 OFFSETS, STILL = np.linspace(-5, 5, 501), 0.02
-"""Offsets of two clocks [s] that are tried, and how long the robot stands still before and after a measurement [s]."""
-RESTING, FEWEST = 0.95, 6  # part of the measured rows at rest with the offset of the clocks, and rows that tell it
+"""Trial offsets between two clocks [s], and how long the robot rests before and after a measurement [s]."""
+RESTING, FEWEST = 0.95, 6  # share of measured rows at rest with the right offset, and the rows needed to find it
 SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
-"""From which number on a time without a unit counts so since 1970: seconds would be in the year 5000."""
+"""Number from which on a time without a unit since 1970 is in this unit: seconds would be in the year 5000."""
 
 
 class Key(NamedTuple):
@@ -150,7 +150,7 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
     chosen = _key(joints, values, key)
     count = len(chosen.left)
     if sorted([chosen.left, chosen.right]) == [[str(i) for i in range(k, k + count)] for k in (0, 1)]:
-        chosen = _row_numbers(joints, values, None)  # one file counts from 0
+        chosen = _row_numbers(joints, values, None)  # either file may count from 0
     again = {name: number for name, number in Counter(chosen.left).items() if number > 1}
     place = {name: i for i, name in enumerate(chosen.left) if name not in again}
     if len(place) < SAME * len(chosen.left):
@@ -163,7 +163,7 @@ def _by_key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Match:
         if within:
             return _by_time(joints, values, key, within)
         raise _few_common(joints, values, chosen, len(right), times)
-    passes: dict[int, int] = {}  # how often the run of its name that a measured row is of has come
+    passes: dict[int, int] = {}  # how often the run with a measured row's name has come
     begun: Counter[str] = Counter()
     for name, run in groupby(range(len(chosen.right)), chosen.right.__getitem__):
         begun[name] += 1
@@ -224,9 +224,9 @@ def _key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Key:
 def _keys(
     joints: CanonicalTable, values: CanonicalTable, key: str, common: Sequence[str], pairs: Sequence[Key]
 ) -> Iterator[Key]:
-    """Yield the label, the only ``common`` column, the only two columns of the same values, or numbers in these.
+    """Yield possible keys: the label, the only ``common`` column, the only pair with the same values or numbers.
 
-    Where columns of the same values tell rows apart (``pairs``), the label that only counts them does not.
+    A label that merely counts rows is none if ``pairs``, columns with the same values, distinguish the rows.
     """
     counted = all(counts_rows(pair.left) for pair in pairs)
     labels = _normal(joints.columns.get("label", ()))
@@ -261,9 +261,9 @@ def _pairs(joints: CanonicalTable, values: CanonicalTable, key: str, numbers: bo
 
 
 def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str], numbers: bool = False) -> Key:
-    """Return a key; measured names that differ by case and leading zeros alone are spelled as those with joints.
+    """Return a key; measured names that differ only in case and leading zeros are spelled as in the table of joints.
 
-    Of ``numbers`` names may differ that are one word and a number on both sides, ``XP1`` and ``P1``, or a number alone.
+    With ``numbers``, names may differ that are one word and a number, or a number alone, on each side: ``XP1``, ``P1``.
     """
 
     def bare(name: str) -> str:
@@ -272,7 +272,7 @@ def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]
     for names in (left, right):
         words = {NUMBERED.sub(r"\1", name) if NUMBERED.fullmatch(name) else None for name in names}
         spelled = len(words) == 1 and None not in words if numbers else any(map(str.isalpha, "".join(names[:1])))
-        if not spelled or len({*map(bare, names)}) < len({*names}):  # other numbers and dates
+        if not spelled or len({*map(bare, names)}) < len({*names}):  # other numbers, and dates
             return Key(how, columns, left, right)
     spelling = {bare(name): name for name in left}
     named = [spelling.get(bare(name), name) for name in right]
@@ -281,9 +281,9 @@ def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]
 
 
 def _naming(table: CanonicalTable, key: str = "") -> dict[str, list[str]]:
-    """Return the keys of columns, labels or left out, that name nearly every row of a reflector and session apart.
+    """Return the cells of label or unused columns that identify nearly every row of a reflector and session.
 
-    Some name is that of a reference point that was measured again. The ``key`` may name rows that were.
+    Names of re-measured reference points may recur; those of the column ``key`` may recur in any row.
     """
     free = [each.column for each in table.meant if each.name in ("", "label", "configuration")]
     free = [name for name in free if not COUNTER.fullmatch(name)]
@@ -322,9 +322,9 @@ def _normal(cells: Sequence[Any]) -> list[str]:
 
 
 def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Return matching pairs of times (N,) and (M,) [s], and their differences (K,) [s].
+    """Return matching pairs of times (N,) and (M,) [s] as two index arrays (K,), and their differences (K,) [s].
 
-    Times are partners if each is the nearest of the other ones to the other.
+    Two times match if each is the closest to the other.
     """
     far, partner = scipy.spatial.KDTree(left[:, None]).query(right[:, None])
     least, _ = scipy.spatial.KDTree(right[:, None]).query(left[:, None])
@@ -336,10 +336,10 @@ def _by_time(joints: CanonicalTable, values: CanonicalTable, key: str, within: f
     if not (np.isfinite(within) and within >= 0):
         raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
     clocks, (there, then) = zip(*(_times(side, key) for side in (joints, values)), strict=True)
-    rounding = 4 * np.spacing(max(np.abs(there).max(), np.abs(then).max()))  # since 1970, half a microsecond
+    rounding = 4 * np.spacing(max(np.abs(there).max(), np.abs(then).max()))  # of times since 1970: half a microsecond
     markers = np.array(values.columns.get("marker", [""] * len(then)))
     found = []
-    for marker in sorted(set(markers)):  # a row of joints has one measured row of each reflector
+    for marker in sorted(set(markers)):  # a row of joints matches one measured row of each reflector
         own = np.flatnonzero(markers == marker)
         rows, of_own, apart = partners(there, then[own], within + rounding)
         found.append((rows, own[of_own], apart))
@@ -358,7 +358,7 @@ def _by_time(joints: CanonicalTable, values: CanonicalTable, key: str, within: f
     moved, ordered = _motion(joints, there, there[left], then[right]), np.unique(there)
     usual = np.median(np.diff(ordered, append=np.inf))
     pause = np.diff(ordered, prepend=-np.inf, append=np.inf) > PAUSE * usual
-    moved[pause[np.searchsorted(ordered, then[right])]] = 0.0  # from one window to the next, of which nothing is known
+    moved[pause[np.searchsorted(ordered, then[right])]] = 0.0  # across a gap nothing is known
     steps = _motion(joints, there, ordered[:-1], ordered[1:])
     if moved.max() > MOVED and (len(there) > LOG * len(right) or np.median(steps) < SMALL):
         count = np.count_nonzero(moved > MOVED)
@@ -429,7 +429,7 @@ def time_column(names: Iterable[str]) -> str | None:
 def seconds(name: str, cells: Sequence[Any]) -> Array:
     """Return times (N,) [s] from numbers, in the unit of the column's name, or from dates: ISO 8601, DIN 1355, UTC.
 
-    Dates with slashes have month and day in the order that a number above 12 shows, in 12 hours the month first.
+    In dates with slashes a number above 12 shows the order of month and day; in 12-hour format the month is first.
     """
     texts = [str(cell).strip() for cell in cells]
     times = np.array([numeral(text) for text in texts])

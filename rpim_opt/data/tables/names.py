@@ -69,13 +69,13 @@ NAMES: tuple[tuple[str, ...], ...] = (
     (r"session(?:_?(?:id|name|no|nr))?|measurement_session|campaign|messreihe|sitzung", "session"),
     (r"(?:station|set_?up|aufstellung|standpunkt)(?:_?(?:id|name|no|nr|nummer))?", "station"),
 )  # fmt: skip
-"""What else a column may be called, in lower case and with underscores, what it means, and why unless that is usual."""
+"""Other column names, in lower case with underscores: their meaning, and the reason unless it is usual."""
 IN_SI = {
     r"%?field\..*|/.*|(?:pose|transform)\.\w+\.\w|position\[\d\]": "ROS: SI units (REP 103)",
     r"rvec_[xyz]": "OpenCV: radians",
     r"(?:actual|target)_(?:q|TCP_pose)_\d": "Universal Robots' RTDE: SI units",
 }
-"""Patterns of names whose units are rad and m, and whose they are."""
+"""Patterns of names with units rad and m, and their origin."""
 KINDS = {
     "derived": frozenset({"deviation", "dev", "delta", "diff", "difference", "error", "err", "residual", "velocity",
                           "vel", "speed", "acceleration"}),
@@ -86,28 +86,28 @@ KINDS = {
                           "istwert", "messwert", "gemessen", "mesuré", "mesurée", "misurato", "misurata", "medido",
                           "medida", "gemeten", "实测"}),
 }  # fmt: skip
-"""Words of a name for values that are measured, commanded or computed from others."""
+"""Words in a name for values that are measured, commanded or computed from others."""
 TURNS = (
     (("a", "b", "c"), ("rz", "ry", "rx"), "KUKA: A, B, C turn about z, y, x", ""),
     (("w", "p", "r"), ("rx", "ry", "rz"), "FANUC: W, P, R turn about x, y, z", ""),
     (("o", "a", "t"), ("rx", "ry", "rz"), "Kawasaki: O, A, T", "intrinsic zyz"),
     (("rvec_x", "rvec_y", "rvec_z"), ("rx", "ry", "rz"), "OpenCV: a rotation vector", "vector"),
 )
-"""Three names that are angles where all of them are there, and the rotation unless that is roll, pitch, yaw."""
+"""Three names that are angles if all are present, and the rotation unless it is roll, pitch, yaw."""
 TCP = (("x", "y", "z", "rx", "ry", "rz"), "Universal Robots' RTDE: position and rotation vector", "vector")
 TCP_POSES = tuple((tuple(f"{which}_tcp_pose_{i}" for i in range(6)), *TCP) for which in ("target", "actual"))
-"""The same of poses that a controller computes: targets, no measurements."""
+"""The same for poses computed by a controller: targets, no measurements."""
 JOINTS = (
     (("s", "l", "u", "r", "b", "t"), "Yaskawa: S, L, U, R, B, T"),
     (("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3"), "Universal Robots: Base, Shoulder, ..., Wrist 3"),
 )
-"""Joints from the base, where all of them are there."""
+"""Joints from the base, if all are present."""
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 UR_NUMBERS = {f"{name}{end}": i for i, name in enumerate(UR_JOINTS, start=1) for end in ("", "_joint")}
-"""Universal Robots' joints, from the base; ROS lists them in the alphabet's order."""
-MOST_PREFIXES = 6  # words before a name that is known
+"""Universal Robots' joints, from the base; ROS lists them alphabetically."""
+MOST_PREFIXES = 6  # words before a known name
 VALUE = frozenset({"position", "pos", "angle", "value"})
-"""What may stand behind the name of a joint for its value."""
+"""Word that may follow the name of a joint."""
 
 
 def recognize(stem: str, joints: Sequence[str] = ()) -> Meaning:
@@ -149,13 +149,13 @@ def endings(stem: str) -> Iterator[tuple[str, str]]:
 
 
 ORDERS, NUMBERED = ("wxyz", "xyzw"), "numbered "
-"""Orders of quaternions, and what stands before one that was found by a check: it holds for numbered columns alone."""
+"""Orders of quaternions, and the prefix of an order found by a check: it holds for numbered columns only."""
 QUATERNION = re.compile(r"(q|quat|quaternion|orientation|orient|rot|rotation)[_ ]?\[?([0-4])\]?")
 ENTRY = re.compile(r"(?:m|t|h|r(?=\D*\d\D*\d)|mat|matrix|tf|pose)[_ \[(]*(\d)[_ ,\]\[]*(\d?)[\])]?")
 SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
-"""Rows and columns of a matrix by its number of entries."""
+"""Rows and columns of a matrix, by its number of entries."""
 EULER = re.compile(r"(?:extrinsic|intrinsic) ([xyz])(?!\1)([xyz])(?!\2)[xyz]")
-"""Three turns about axes that stand still, or that turn with it."""
+"""Three rotations about fixed axes (extrinsic), or about axes that rotate with the body (intrinsic)."""
 ROUNDED = 1e-6  # the last row of a matrix is 0 0 0 1 within this
 
 

@@ -20,13 +20,13 @@ from rpim_opt.data.measurements.pose import position
 from rpim_opt.robot.mdh import Robot
 
 Numbers = dict[tuple[str, str], Array]
-"""Columns of numbers [SI] by (stem, dimension), and by (stem, "") where a stem has one dimension."""
+"""Columns of numbers [SI] by (stem, dimension); also by (stem, "") if the stem has one dimension."""
 TRACKER = {"range": ("length", "ratio"), "transverse": ("length",), "angle": ("angle",),
            "x": ("length",), "y": ("length",), "z": ("length",)}  # fmt: skip
 """The keys of ``[noise.tracker]`` and their dimensions."""
 APPROACH = re.compile(r"(?:to_)?approach\d+")  # columns of directions
-DEFINITE = 1e-9  # a correlation matrix whose smallest eigenvalue is not above this is no covariance
-SPREADS = {"sigma": 1.0, "u95": 2.0}  # coverage factors of standard and of expanded uncertainties, by their stems
+DEFINITE = 1e-9  # a correlation matrix needs a larger smallest eigenvalue
+SPREADS = {"sigma": 1.0, "u95": 2.0}  # coverage factors of standard and expanded uncertainties, by stem
 
 
 def read_data(
@@ -36,23 +36,22 @@ def read_data(
 
     Every column's name carries its unit: ``label, q1_deg, ..., x_mm, y_mm, z_mm``. Optional columns are
 
-    - ``label``; ``configuration`` (rows of one stay together; rows whose joint values differ by no more than
-      0.1 mrad or 0.1 mm by default);
-    - ``marker`` (which reflector); ``fixture`` (which anchor, plane or sphere); ``point``
-      or ``plane`` (which one was touched); ``session`` (any text: rows of one share an error of the registration);
+    - ``label``; ``configuration`` (by default the same for rows whose joint values differ by at most 0.1 mrad or
+      0.1 mm); ``marker`` (name of the reflector); ``fixture`` (anchor, plane or sphere); ``point`` or ``plane`` (what
+      was touched); ``session`` (any text: its rows share an error of the registration);
     - ``sigma_mm``, ``sigma_x_mm`` (standard deviations of a row, of one component), ``u95_mm``, ``u95_x_mm``
       (expanded uncertainties, coverage factor 2), ``cov_x_y_mm2``, ``cov_x_rx_mm_mrad`` (covariances);
     - ``tau1_Nm``, ... (joint torques); ``payload_kg`` (mass at the flange); ``approach1``, ... (direction in which the
       joint moved last, -1 or 1, 0 where it is not known); ``temperature_C`` (of the robot, for ``expansion``);
-    - what terms (`Model`) of the robot and a measurement of your own name as their columns;
+    - columns of user-defined terms (`Model`) and measurement types;
     - for a second point ``to_q1_deg``, ..., ``to_marker``, ``to_tau1_Nm``, ``to_approach1``.
 
     The ``source`` is a path (``.csv``, ``.parquet``, ``.xlsx``), a pandas or polars data frame, or a mapping from
-    column names to cells. Number and types of the ``robot``'s joints decide the joint columns, ``measurement`` those of
-    measured values. ``noise`` has standard deviations where no column states them: ``{"position_mm": 0.03}``,
-    ``{"x_mm": 0.03, ...}``, and ``{"tracker": {"range_um": 15, "range_ppm": 6, ...}}`` for a laser tracker
-    (its data sheet's terms along and across the beam), added to them. InputError names the file, the row or column,
-    what was found and what is accepted.
+    column names to cells. Number and types of the ``robot``'s joints determine the joint columns, ``measurement`` those
+    of measured values. ``noise`` has standard deviations for rows without their own: ``{"position_mm": 0.03}``,
+    ``{"x_mm": 0.03, ...}``, and in addition ``{"tracker": {"range_um": 15, "range_ppm": 6, ...}}`` for a laser tracker
+    (its data sheet's terms along and across the beam). InputError names the file, the row or column, what was found and
+    what is accepted.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -62,7 +61,7 @@ def read_data(
     >>> data.q.round(3).tolist(), data.blocks[0].y[0].tolist()  # [rad], [m]
     ([[0.0, 0.0], [1.571, 0.524]], [0.401, 0.0, 0.0])
     """
-    declared = declared_noise(noise or {}, measurement)  # outside: a mistake there is not the table's
+    declared = declared_noise(noise or {}, measurement)  # outside: such a mistake is not the table's
     with in_file(source):
         return _dataset(read_columns(source), robot, declared, measurement)
 
@@ -154,7 +153,7 @@ def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str
     """Return the columns of numbers [SI]; refuse unknown, duplicate and missing ones."""
     known = number_columns(robot, kind)
     columns = quantities_of(table, known, text_columns(kind), label)
-    # joints, measured values, and whole groups of what is there in part
+    # joints, measured values, and partly present groups
     joints, *groups = ([f"{stem}{i}" for i in range(1, robot.dof + 1)] for stem in ("q", "tau", "approach"))
     required = [*joints, *values_form(columns, kind)[0], *(name for name in kind.depends_on if name in kind.extra)]
     if kind.points == 2:
@@ -245,7 +244,7 @@ def require_unique(names: Sequence[str], column: str) -> None:
 def _tracker_covariances(points: Array, terms: Mapping[str, float]) -> Array:
     """Return the covariances (N, 3, 3) [m^2] of points (N, 3) [m] in a laser tracker's frame, from its data sheet.
 
-    With u the unit vector from the tracker's place x, y, z to the point at distance D::
+    With u the unit vector from the tracker's position x, y, z to the point at distance D::
 
         C = (range + range_ppm D)^2 u u' + (transverse + angle D)^2 (1 - u u')
     """
@@ -284,7 +283,7 @@ def covariances(
 ) -> Array:
     """Return the covariances of the residual's components [SI], (N, k, k) or (1, k, k) if the same for all.
 
-    A standard deviation that a row states of itself replaces the declared one and the tracker's part of it.
+    A standard deviation stated in a row replaces the declared one, including the tracker's part.
     """
     names = list(kind.components)
     k = len(names)
@@ -296,7 +295,7 @@ def covariances(
     spread: list[Any] = []
     lacking = np.zeros(k, dtype=bool)
     for i, (name, dimension) in enumerate(kind.components.items()):
-        # what rows state: of this component before those of all of its dimension
+        # stated in rows: of this component before those of its dimension
         sources = [(key, factor) for of, factor in SPREADS.items() for key in ((f"{of}_{name}", ""), (of, dimension))]
         stated = [columns[key] / factor for key, factor in sources if key in columns]
         common = next((key for key, of in kind.noise.items() if of == dimension), "")
@@ -306,7 +305,7 @@ def covariances(
             column = with_unit(f"sigma_{name}", dimension, count=2)[-1]
             accepted = f"{with_unit(common, dimension, count=2)[-1]}, or a column {column}"
             raise InputError("table noise", f"no standard deviation for '{name}'", accepted)
-        spread.append(0.0 if own is None else own)  # the tracker or a column has it all
+        spread.append(0.0 if own is None else own)  # the tracker's covariance or a column states it
     deviation = np.stack(np.broadcast_arrays(*map(np.atleast_1d, spread)), axis=1)
     covariance = deviation[:, :, None] ** 2 * np.eye(k) + instrument * np.outer(lacking, lacking)
     for i, j in np.ndindex(k, k):

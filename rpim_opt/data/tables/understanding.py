@@ -24,18 +24,18 @@ from rpim_opt.data.tables.reading import number_columns, text_columns
 from rpim_opt.robot.mdh import Robot
 
 TURNED = ("rx", "ry", "rz")
-"""Columns of three turns; without a unit they may also be a rotation vector, as Universal Robots' are."""
+"""Columns of three rotation angles; without a unit they may also be a rotation vector, as of Universal Robots."""
 COORDINATES = {"x", "y", "z"}
 EXTERNAL = re.compile(r"e_?1|ext(?:ernal)?_?(?:axis_?)?1?", re.IGNORECASE)
 ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
 READING = re.compile(r"((?:p|pos|position|meas|measured|shot)?[\s_]*([xyz]))[\s_]*([1-9])", re.IGNORECASE)
-NEAR_READINGS = 0.01  # part of the points' spread up to which those of a row are one point, and no other reflectors
+NEAR_READINGS = 0.01  # part of the points' spread within which a row's readings are of one reflector
 INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
-"""In the name of a coordinate that is not the robot's own; actual may be either."""
+"""Instrument in the name of a coordinate: not the robot's own; actual may be either."""
 CONTROLLER = re.compile(r"\$?pos_act|actual_tcp", re.IGNORECASE)
-"""Beginning of coordinates that a controller computes: KUKA's and Universal Robots'."""
-PLACED = 3  # configurations, at least, for each place of an instrument: three points tell it
-INCOMPLETE = 0.25  # share of the rows that may lack one of several values, and are left out then
+"""Beginning of coordinates computed by a controller: KUKA's and Universal Robots'."""
+PLACED = 3  # minimum of configurations per position of an instrument: three points determine it
+INCOMPLETE = 0.25  # share of rows that may lack one of several values and are then left out
 MEANINGS = {
     "label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
     "session": "session of the measurements", "to_marker": "reflector of the second point",
@@ -47,7 +47,7 @@ MEANINGS = {
     r"u95_(\w+)": r"U95 of \1", r"sigma_(\w+)": r"standard deviation of \1",
     r"cov_([^_]+)_(\w+)": r"covariance of \1, \2",
 }  # fmt: skip
-"""What our columns are, in words; the first pattern that fits counts."""
+"""Descriptions of canonical columns; the first matching pattern counts."""
 
 
 class Column(NamedTuple):
@@ -64,10 +64,10 @@ class Column(NamedTuple):
 class CanonicalTable:
     """A raw table with canonical names.
 
-    ``columns`` are cells by our names, ``raw`` those of the file by its names in lower case, of the same rows. What
-    ``doubt`` is names the option that says how orientations are to be read where only a check against the robot shows
-    it: ``quaternion``, ``rotation``. Of several files as one, ``file`` is the first, and ``keys`` are the columns that
-    joined them, in lower case.
+    ``columns`` are cells by canonical names, ``raw`` those of the same rows by the file's names in lower case.
+    ``doubt`` is the option, ``quaternion`` or ``rotation``, for an interpretation of orientations that only a check
+    against the robot can confirm. Of several joined files, ``file`` is the first, and ``keys`` are the joining columns,
+    in lower case.
     """
 
     columns: Columns
@@ -105,7 +105,7 @@ def interpret(
 ) -> CanonicalTable:
     """Interpret a raw table with the names that `read_data` takes, leaving out other columns and rows without values.
 
-    ``joints`` are the names of the robot file. Of ``targets`` what was commanded counts; rows may lack either values.
+    ``joints`` are the robot file's names. With ``targets`` commanded values count; rows may lack either kind of value.
     """
     units = options.units
     raw = _readings_below_each_other(raw)
@@ -141,9 +141,9 @@ def interpret(
 
 
 def _readings_below_each_other(raw: RawTable) -> RawTable:
-    """Return a table with a row a reading, where several of one point stand side by side, X1, Y1, Z1, X2, ...
+    """Return a table with one row per reading, if readings of one point stand side by side, X1, Y1, Z1, X2, ...
 
-    Names of the points, a text in every row that no other has, get the reading's number.
+    Point names (a text that differs in every row) get the reading's number.
     """
     named = {name: READING.fullmatch(split(name)[0].strip()) for name in raw.columns}
     of = {(int(match[3]), match[2].lower()): name for name, match in named.items() if match}
@@ -152,7 +152,7 @@ def _readings_below_each_other(raw: RawTable) -> RawTable:
         return raw
     values = np.array([[numeral(str(cell)) for cell in raw.columns[of[each]]] for each in sorted(of)])
     values = values.reshape(count, 3, -1)
-    apart = np.fmax.reduce(values) - np.fmin.reduce(values)  # of those that were taken
+    apart = np.fmax.reduce(values) - np.fmin.reduce(values)  # of existing readings
     if not np.nanmax(apart) < NEAR_READINGS * np.nanstd(values, axis=(0, 2)).max():
         return raw
     columns: dict[str, Sequence[Any]] = {}
@@ -169,13 +169,13 @@ def _readings_below_each_other(raw: RawTable) -> RawTable:
 
 
 def _as_quaternions(columns: Columns, meant: Sequence[Column], rotation: str) -> tuple[Columns, list[Column]]:
-    """Return columns and meanings with a quaternion in the place of three turns.
+    """Return columns and meanings with a quaternion in place of three rotation angles.
 
-    Of ``intrinsic zyx`` the turn about z is first, and the column rz has it; of ``intrinsic zyz`` the columns have the
-    first, second and third turn.
+    With ``intrinsic zyx`` the first rotation, about z, is in column rz; with ``intrinsic zyz`` the columns have the
+    first, second and third rotation.
     """
     names = {split_unit(name)[0]: name for name in columns}
-    if names.keys().isdisjoint(TURNED):  # a file of joint values, beside one of poses
+    if names.keys().isdisjoint(TURNED):  # joint values, from a file beside one of poses
         return columns, list(meant)
     if any(turn not in names for turn in TURNED):
         raise InputError("the header", "no columns rx, ry, rz", "three of them, or no --rotation")
@@ -267,10 +267,10 @@ def counts_rows(keys: Sequence[str]) -> bool:
 def _choose_label(read: Meanings, table: Columns, key: str) -> None:
     """Of several labels keep the stated key, or the one that distinguishes rows and is no row number."""
     names = {name: [*map(str, table[name])] for name, each in read.items() if each.stem in ("label", "configuration")}
-    if len(names) == 1 and all(map(_unique, names.values())):  # a pose of each row
+    if len(names) == 1 and all(map(_unique, names.values())):  # one pose per row
         read.update({name: read[name]._replace(stem="label") for name in names})
     cells = {name: [cell.strip() for cell in own] for name, own in names.items() if read[name].stem == "label"}
-    for group, point in permutations(cells, 2):  # SpatialAnalyzer's, a group for every configuration
+    for group, point in permutations(cells, 2):  # SpatialAnalyzer: one group per configuration
         rows = [*zip(cells[group], cells[point], strict=True)]
         repeated = len(rows) > len(set(cells[group])) > len(set(cells[point])) > 1
         if re.search("group|gruppe", group.lower()) and repeated and len(set(rows)) == len(rows):
@@ -298,7 +298,7 @@ def _read(name: str, group: str, known: Sequence[str], names: Sequence[str], joi
             return Meaning(f"q{joints.index(whole) + 1}", unit, "a joint of the robot file")
     if stem in known:
         return Meaning(stem, unit, "by its name")
-    if stem.lower() in names:  # elsewhere such a column holds labels
+    if stem.lower() in names:  # otherwise such a column holds labels
         return Meaning(stem.lower(), unit, "touched point")
     reading = recognize(stem, joints)
     if group and not reading.why:  # the words of a group without meaning
@@ -393,7 +393,7 @@ def _prefixed(read: Meanings, joints: Sequence[str]) -> dict[str, Meanings]:
                 bare = prefix.strip(" ._/:-")
                 new = Meaning(known.stem, each.unit, f"{known.why}, of {bare}", known.kind or each.kind)
                 by_prefix.setdefault(bare, {})[name] = new
-                break  # the shortest prefix: orientation/x is no x
+                break  # the shortest prefix: orientation/x is not x
     return by_prefix
 
 
@@ -475,7 +475,7 @@ def _under_our_names(
     meant: list[Column] = []
     stems: dict[str, Sequence[str]] = {**dict.fromkeys(text_columns(kind), ()), **known}
     dimensions = {stem: list(filter(None, each)) for stem, each in stems.items()}
-    if not {each.stem for each in read.values()} & {"qw", "rx", "r11"}:  # an uncertainty of all axes is one of lengths
+    if not {each.stem for each in read.values()} & {"qw", "rx", "r11"}:  # an uncertainty of all axes is then a length
         dimensions |= {stem: ["length"] for stem, each in dimensions.items() if len(each) > 1}
     for name, cells in table.items():
         stem, _, reason, _ = read[name]
@@ -524,7 +524,7 @@ def _unit(name: str, read: Meaning, dimensions: Sequence[str], units: Mapping[st
     """Return a column's unit and why: its own, the stated one, that of its dialect."""
     if read.unit:
         return read.unit, "in the header"
-    # a sigma may be of lengths or of angles: no unit of one dimension is meant
+    # a sigma may be of lengths or angles: a unit by dimension does not apply
     only = dimensions[0] if len(dimensions) == 1 else ""
     for key in (read.stem, read.stem.rstrip("0123456789"), only):
         if key in units:
@@ -559,7 +559,7 @@ def _rows_with_values(table: CanonicalTable, robot: Robot, kind: Measurement) ->
         lacking = [sum(is_missing(str(cell)) for cell in row) for row in zip(*own, strict=True)]
         none = [i for i, count in enumerate(lacking) if count == len(own)]
         some = [i for i, count in enumerate(lacking) if 0 < count < len(own)]
-        if len(some) > INCOMPLETE * len(labels):  # then a column is wrong, which is named where its numbers are read
+        if len(some) > INCOMPLETE * len(labels):  # a wrong column: named where its numbers are read
             some = []
         for rows, which in ((none, f"without {what} values"), (some, f"that lack one of their {what} values")):
             if rows:

@@ -1,9 +1,9 @@
 """Links of a script for the Robotics Toolbox, as a DH table in rad and m; base and tool are left out.
 
-Of MATLAB ``L(1) = Link([theta d a alpha sigma offset], 'modified')``, ``Link('d', 0.4, 'a', 0.025, 'alpha', -pi/2)``,
-``Revolute(...)``, ``PrismaticMDH(...)``, of Python ``RevoluteDH(d=0.4, a=0.025, alpha=-pi/2)``, ``PrismaticMDH(...)``,
-``DHLink(...)``: what is not called modified is in the standard convention. The joint's own variable is not read: where
-it begins is the offset.
+Read are MATLAB's ``L(1) = Link([theta d a alpha sigma offset], 'modified')``, ``Revolute(...)``, ``PrismaticMDH(...)``,
+``Link('d', 0.4, 'a', 0.025, 'alpha', -pi/2)``, and Python's ``RevoluteDH(d=0.4, a=0.025, alpha=-pi/2)``,
+``PrismaticMDH(...)``, ``DHLink(...)``: standard convention unless called modified. The joint's own variable (theta or
+d) is not read; its zero is given by the offset.
 """
 
 from __future__ import annotations

@@ -32,48 +32,48 @@ WRITTEN = (".toml", ".json", ".csv")  # endings of what is written
 LIMITS = ("lower", "upper")
 CENTRE = ("centre_x", "centre_y", "centre_z")
 SI = {"angle": "rad", "length": "m"}
-FAR = 10.0  # a common normal that is further away [m] is that of nearly parallel axes
+FAR = 10.0  # a common normal further away than this [m] means nearly parallel axes
 CONVENTIONS = {"modified": "modified", "craig": "modified", "proximal": "modified", "mdh": "modified",
                "standard": "standard", "paul": "standard", "distal": "standard", "classic": "standard",
                "hayati": "standard"}  # fmt: skip
-"""What people call the conventions of Denavit-Hartenberg tables."""
+"""Common names of the conventions of Denavit-Hartenberg tables."""
 INDEX_BEFORE = re.compile(r"[_\s(\[{]*(?:[ij]\s*[-\u2212]\s*1|ⱼ₋₁)[)\]}]*", re.IGNORECASE)
-"""Of alpha and a of the link before: the table is modified."""
+"""Index i-1 on alpha or a, those of the previous link: the table is modified."""
 INDEX = re.compile(r"(?:[_\s(\[{]+i|ⱼ)[)\]}]*(?=\s|$)")
-"""Of the joint itself, ``d(i)``, ``theta_i``: common to all conventions."""
+"""Index i, ``d(i)``, ``theta_i``: used in all conventions."""
 SHEET = {"\u03b1": "alpha", "\u237a": "alpha", "θ": "theta", "β": "beta", "twist": "alpha", "theta offset": "theta",
          "offset": "theta", "r": "a", "min": "lower", "minimum": "lower", "max": "upper", "maximum": "upper",
          "q\u207b": "lower", "q\u207a": "upper", "sigma": "type", "\u03c3": "type", "joint type": "type"}  # fmt: skip
-"""Other names of columns, those that the Robotics Toolbox prints among them."""
+"""Other names of columns, including those that the Robotics Toolbox prints."""
 TYPES = {
     **dict.fromkeys(("r", "rot", "rotary", "rotational", "continuous", "0"), "revolute"),
     **dict.fromkeys(("p", "t", "lin", "linear", "trans", "translational", "1"), "prismatic"),
 }
-"""Other words for a joint's type, 0 and 1 the sigma of the Robotics Toolbox."""
+"""Other words for a joint's type; 0 and 1 are sigma of the Robotics Toolbox."""
 RANGE = re.compile(r"[\s_]*(?:range|limits?|bereich|grenzen?)[\s_]*")
-"""Beside the word of a limit, ``range min``, ``lower limit``; alone a column of both."""
+"""Word for joint limits: beside the word of one limit, ``range min``, ``lower limit``; alone, a column of both."""
 BOTH_LIMITS = re.compile(
     r"(?:[±+]\s*({0})|([+-]?{0})\s*°?\s*(?:\.\.+|…|/|to|bis|~|-|\u2013)\s*([+-]?{0}))?\s*°?".format(r"\d+(?:\.\d+)?")
 )
-"""Two limits in a cell, ``±180``, ``-180..180``; tables of text have their ± as +."""
+"""Two limits in a cell, ``±180``, ``-180..180``; text files are read with + for ±."""
 SHEET_ORDER = ("theta", "d", "a", "alpha", "beta")  # of a data sheet in the standard convention
 JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")  # columns of the joints' own names
 ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*°?", re.IGNORECASE)
 """A joint's variable with its offset, ``q2 - 90``."""
 ANGLES = tuple(name for name, dimension in MDH_DIMENSION.items() if dimension == "angle")
 TURNS, NEARLY = {np.pi / 2: "pi/2", np.pi: "pi"}, 0.002
-"""Angles [rad] of most tables, and what three digits of them miss at most."""
+"""Angles [rad] that most tables mean, and the largest error of stating them with three digits."""
 SIGNS = {"°": "deg", "pi": "rad", "π": "rad"}  # of units in cells
-LARGEST_TURN = 2 * np.pi  # [rad] in a table of a robot's links: larger numbers are degrees
+LARGEST_TURN = 2 * np.pi  # [rad]; larger angles in a table are in degrees
 JOINT_NAME = re.compile(r"(?:joint|axis|link|achse|gelenk)[\s_]*\d+", re.IGNORECASE)  # in a cell
 WITHOUT_COLUMN = {
     "coupling": "a coupling of joints",
     "mounting": "another mounting than on the floor",
     "payload": "a payload",
 }
-"""What a table with one row per joint has no place for."""
+"""Properties of a robot that a table with one row per joint cannot hold."""
 Mounting = str | list[Annotated[float, Field(strict=False)]]
-"""``"floor"``, ``"ceiling"``, ``"wall"``, or where gravity points in the robot's base."""
+"""``"floor"``, ``"ceiling"``, ``"wall"``, or the direction of gravity in the robot's base frame."""
 
 
 # Schema
@@ -153,7 +153,7 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
         if len(pair) != 2 or not pair[0] < pair[1]:
             raise InputError(f"key joint {number}.limits", f"no range {pair} [SI]", "[lower, upper]")
     gravity = Gravity()
-    if any(joint.mass is not None for joint in table.joint):  # then others weigh nothing
+    if any(joint.mass is not None for joint in table.joint):  # links without a stated mass then weigh nothing
         masses = tuple(joint.mass or 0.0 for joint in table.joint)
         centres = tuple((joint.centre_x, joint.centre_y, joint.centre_z) for joint in table.joint)
         gravity = Gravity(masses=masses, centres=centres)
@@ -193,8 +193,8 @@ def read_robot(path: str | Path) -> Robot:
     """Return the robot of a ``.toml``, ``.json`` or ``.csv`` file, or a ready one by its name (``ro.robots()``).
 
     TOML and JSON have the keys of ``robot.toml`` (the guide "Your own robot"). CSV has one row per joint and the keys
-    of a ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``,
-    ``lower,upper`` (in the unit of theta, of d for prismatic joints, or of their own), ``mass_kg``,
+    of a ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``; optional are ``type``, ``sign``,
+    ``lower,upper`` (in the unit of theta, or of d for prismatic joints, unless the header states one), ``mass_kg`` and
     ``centre_x_mm,centre_y_mm,centre_z_mm``; a column ``convention`` states ``modified`` or ``standard``. InputError
     names file, key or column.
 
@@ -220,10 +220,10 @@ def read_robot(path: str | Path) -> Robot:
 def read_sheet(path: Path, convention: str = "", units: Mapping[str, str] = MappingProxyType({})) -> RobotSetup:
     """Return the robot of a table with one row per joint, in the convention stated there or by ``convention``.
 
-    Where neither header nor cells state units of angles or lengths they are those of ``units``, by dimension.
+    ``units`` by dimension hold for angles or lengths for which neither header nor cells state a unit.
 
-    ``modified`` (Craig, proximal) is that of this package. ``standard`` (Paul, distal) and, with a column beta, that of
-    Hayati are converted exactly; what follows the last joint becomes the tool::
+    ``modified`` (Craig, proximal) is the convention of this package. ``standard`` (Paul, distal) and Hayati's, which
+    has a column beta, are converted exactly; what follows the last joint becomes the tool::
 
         modified   Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)
         standard   Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta)
@@ -232,7 +232,7 @@ def read_sheet(path: Path, convention: str = "", units: Mapping[str, str] = Mapp
         raw = read_links(path)
     else:
         raw = read_table(path, turned=lambda grid: {"alpha", "a", "d"} <= {_stem(row[0])[0] for row in grid.rows})
-    for row in raw.left:  # a remark below the table has few cells, and no numbers alone
+    for row in raw.left:  # a remark below the table: few cells, not only numbers
         cells = [cell for cell in row if cell]
         if len(cells) > len(raw.columns) / 2 or any(map(is_numeral, cells)) or JOINT_NAME.fullmatch(cells[0]):
             raise InputError("the table", f"'{', '.join(cells)[:60]}', no row of numbers", "one row per joint")
@@ -280,9 +280,9 @@ def _sheet_columns(raw: RawTable, units: Mapping[str, str]) -> tuple[dict[str, l
 def _unstated(
     name: str, stem: str, texts: Sequence[str], stated: Collection[str], units: Mapping[str, str]
 ) -> tuple[str, str]:
-    """Return the unit of a column whose header has none, and a note on where it is from: cells, other angles, options.
+    """Return the unit of a column whose header has none, and a note on its source: cells, other angles or options.
 
-    Empty where it needs none; InputError where it needs one.
+    Empty for a column without unit; InputError if a unit is required and nothing states it.
     """
     dimension = MDH_DIMENSION.get(stem, "")
     if stem in ANGLES:
@@ -325,7 +325,7 @@ def _from_standard(robot: Robot) -> RobotSetup:
     robot = replace(robot, source="converted from a DH table in the standard convention (Paul)")
     alpha, a, theta, d, beta = robot.mdh.T
     shifted = np.column_stack([np.append(0.0, alpha[:-1]), np.append(0.0, a[:-1]), theta, d, beta])
-    if not beta.any():  # the same numbers, alpha and a one row further
+    if not beta.any():  # the same numbers, with alpha and a one row further
         return RobotSetup(replace(robot, mdh=shifted), np.zeros(6), np.array([a[-1], 0.0, 0.0, alpha[-1], 0.0, 0.0]))
     turns = [numeric_link(theta=each, d=along) for each, along in zip(theta, d, strict=True)]
     links = [turn @ numeric_link(alpha[i], a[i], beta=beta[i]) for i, turn in enumerate(turns)]
@@ -365,12 +365,12 @@ def _joint(cells: dict[str, str]) -> dict[str, Any]:
 def write_robot(robot: Robot, path: str | Path, convention: str = "modified") -> None:
     """Write a robot as ``.toml``, ``.json`` or ``.csv``, so that `read_robot` gives back exactly the same numbers.
 
-    Angles are in degrees and lengths in millimetres where that loses no bit, in rad and m elsewhere. With
-    ``convention`` ``"standard"`` (or another word for it) a CSV goes from axis 1 to the same last frame, without alpha1
-    and a1 and with zeros for a and alpha of the last row, in mm and degrees with 9 decimals.
+    Angles are in degrees and lengths in millimetres where this conversion is exact, otherwise in rad and m. With
+    ``convention`` ``"standard"`` (or a synonym) a CSV goes from axis 1 to the same last frame, without alpha1 and a1
+    and with a = alpha = 0 in the last row, in mm and degrees with 9 decimals.
 
-    The file is written whole or not at all. Refused are another ending, one of two limits infinite, and in CSV a
-    coupling of joints, a mounting other than on the floor, and a payload.
+    The file is written whole or not at all. InputError for another ending, one infinite limit of two, and in CSV for
+    coupled joints, a mounting other than on the floor, and a payload.
     """
     path = Path(path)
     ending = _ending(path, WRITTEN)
@@ -409,11 +409,11 @@ def joints_alone(robot: Robot, file: Path) -> tuple[Robot, list[str]]:
 def write_robodk(robot: Robot, path: str | Path) -> list[str]:
     """Write the four modified DH numbers of every joint as CSV, ``joint,alpha_deg,a_mm,theta_deg,d_mm``.
 
-    For RoboDK's robot parameters, a modified DH table (Craig's, "DHM") in mm and degrees; Hayati's betas are turned
-    into common normals. Its API takes such a table (``SetRobotParams(robot, dhm, poseBase, poseTool)``,
-    RoboDK/RoboDK-API, C#), and documents neither the columns' order nor a file: transfer the numbers by name, and
-    compare a pose. Returned are sentences on joint values that the table counts otherwise than the controller, and on
-    axes so nearly parallel that rounded numbers lose the robot; refused is a beta after the last joint.
+    For RoboDK's robot parameters, a modified DH table (Craig's, "DHM") in mm and degrees; Hayati's betas become common
+    normals. RoboDK's API takes such a table (``SetRobotParams(robot, dhm, poseBase, poseTool)``, RoboDK/RoboDK-API,
+    C#), but documents neither the order of columns nor a file: transfer the numbers by name, and compare a pose. Return
+    sentences on joint values that the table counts differently from the controller, and on axes so nearly parallel that
+    rounding changes the robot noticeably; InputError for a beta after the last joint.
     """
     table = without_beta(robot).mdh
     notes = joints_alone(robot, Path(path))[1]

@@ -31,7 +31,7 @@ from rpim_opt.robot.mdh import Robot
 JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 DELTAS = {"theta": "delta_theta", "d": "delta_d", "a": "delta_a", "alpha": "delta_alpha"}
 SIX = ("x", "y", "z", "roll", "pitch", "yaw")
-PAIR = re.compile(rb"([A-Za-z_]\w*)[ \t]*:(?:[ \t]+|$|(?=\{))([^\s,{}]*)")  # also of a mapping {x: 0, y: 0}
+PAIR = re.compile(rb"([A-Za-z_]\w*)[ \t]*:(?:[ \t]+|$|(?=\{))([^\s,{}]*)")  # also in a mapping {x: 0, y: 0}
 
 
 def _number(text: bytes, where: str) -> float:
@@ -43,9 +43,9 @@ def _number(text: bytes, where: str) -> float:
 
 
 def _in_base(robot: Robot) -> Robot:
-    """Return the same arm in the controller's Base, where it is in ROS's ``base_link``, half a turn from there.
+    """Return the same arm in the controller's Base; ROS's ``base_link`` is rotated from it by half a turn about z.
 
-    Rot(z, pi) T Rot(z, -pi) is the link T with the opposite alpha, a and beta; half a turn stays after the last joint.
+    Rot(z, pi) T Rot(z, -pi) is the link T with alpha, a and beta negated; half a turn is left after the last joint.
     """
     if not (robot.mdh[2:4, 1] > 0).all():
         return robot
@@ -61,15 +61,15 @@ def _in_base(robot: Robot) -> Robot:
 def read_ur_calibration(path: str | Path, nominal: Robot) -> RobotSetup:
     """Return the robot that a controller's ``calibration.conf`` describes, in the controller's Base.
 
-    Its section ``[mounting]`` lists ``delta_theta``, ``delta_a``, ``delta_d`` and ``delta_alpha``, from the base
-    joint to wrist 3, in rad and m. They are added to the model's standard DH parameters, all of them::
+    Its section ``[mounting]`` lists ``delta_theta``, ``delta_a``, ``delta_d`` and ``delta_alpha``, from the base joint
+    to wrist 3, in rad and m. They are added to all standard DH parameters of the model::
 
         T = prod_i Rot(z, q_i + theta_i) Trans(z, d_i) Trans(x, a_i) Rot(x, alpha_i)
 
     Order, sign and units: UniversalRobots/Universal_Robots_ROS_Driver, ur_calibration (which adds such deltas in its
     tests), and forum.universal-robots.com, thread 1638, "UR10 Calibration.conf DH model generation". Along
-    the nearly parallel axes 2, 3 and 4 the file's d are metres to kilometres, theta and a follow; here beta2 and
-    beta3 take the tilt and every number is near nominal.
+    the nearly parallel axes 2, 3 and 4 the file's d are metres to kilometres, with theta and a to match; here beta2 and
+    beta3 describe the tilt, and every number is close to nominal.
 
     ``nominal`` is the model, a ready robot such as ``read_robot("ur5e")``.
 
@@ -95,9 +95,9 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> RobotSetup:
 def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, target: str | Path) -> list[str]:
     """Write a ``calibration.conf`` with an identified robot's deltas, everything else as in ``source``.
 
-    The betas are turned into common normals first. Not tried on a controller, whose checks (the file has checksums of
-    the joints) are not documented: keep the original. ``robot`` is in the controller's Base, or with ``nominal`` in
-    ROS's ``base_link``. Refused are alpha1 or a1 that deviate (the base has to hold them), beta6, and axes too nearly
+    The betas become common normals first. Untested on a controller, whose checks (the file has checksums of the joints)
+    are undocumented: keep the original. ``robot`` is in the controller's Base or, with ``nominal``, in ROS's
+    ``base_link``. InputError if alpha1 or a1 deviate (they belong into the base), for beta6, and for axes too close to
     parallel.
     """
     path = Path(source)
@@ -114,7 +114,7 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
         raise InputError("robot", found, "a Universal Robot: a2 and a3 of its controller are negative")
     change = without_beta(robot).mdh - nominal.mdh
     change[:, 2] = np.angle(np.exp(1j * change[:, 2]))
-    behind = np.vstack([change[1:], np.zeros(5)])  # alpha and a stand a row further up
+    behind = np.vstack([change[1:], np.zeros(5)])  # alpha and a are one row further up
     new = {"theta": change[:, 2], "d": change[:, 3], "a": behind[:, 1], "alpha": behind[:, 0]}
     edits = {
         places[name]: ", ".join(repr(float(v)) for v in values)
@@ -151,12 +151,12 @@ def _deltas(data: bytes) -> tuple[dict[str, Array], dict[str, tuple[int, int]]]:
 def read_ur_kinematics(path: str | Path) -> RobotSetup:
     """Return the robot of a ``kinematics.yaml`` of ROS, in the controller's Base (``base_link`` turned half a turn).
 
-    Under ``kinematics`` stand shoulder, upper_arm, forearm, wrist_1, wrist_2 and wrist_3, each with the origin of its
-    joint in the frame of the one before, x y z [m] and roll pitch yaw [rad], and ``hash``, which names the robot
+    ``kinematics`` has shoulder, upper_arm, forearm, wrist_1, wrist_2 and wrist_3, each with the origin of its joint in
+    the frame of the previous one, x y z [m] and roll pitch yaw [rad], and ``hash``, which identifies the robot
     (UniversalRobots/Universal_Robots_ROS_Driver, ur_calibration; read by ros-industrial/universal_robot,
-    ur_description). ur_description puts the angles into a URDF, so that they mean R = Rz Ry Rx, as here.
-    ur_calibration computes them for R = Rx Ry Rz: a file from a controller therefore describes the robot only to
-    the product of its small yaw angles (about 1e-4 rad) and the reach; `read_ur_calibration` has no such loss.
+    ur_description). ur_description puts the angles into a URDF, where they mean R = Rz Ry Rx, as here. ur_calibration
+    computes them for R = Rx Ry Rz: a controller's file is therefore accurate only to the product of two of its small
+    angles (about 1e-4 rad) and the reach; `read_ur_calibration` has no such loss.
 
     >>> import rpim_opt as ro
     >>> arm = ro.robot.read_ur_kinematics("kinematics.yaml")
@@ -174,10 +174,10 @@ def read_ur_kinematics(path: str | Path) -> RobotSetup:
 def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) -> list[str]:
     """Write a ``kinematics.yaml`` with an identified robot's origins, everything else (and the hash) as in ``source``.
 
-    The driver compares the hash, that of the robot, with the controller's. ``source`` is the original, or
-    ur_description's default_kinematics.yaml of the model; its `read_ur_kinematics` has to be the robot whose parameters
-    were identified, in the controller's Base or in ROS's ``base_link``. Refused are another robot, and a beta after the
-    last joint.
+    The driver compares the robot's hash with the controller's. ``source`` is the original file, or the model's
+    default_kinematics.yaml of ur_description; its `read_ur_kinematics` has to be the robot whose parameters were
+    identified, in the controller's Base or in ROS's ``base_link``. InputError for another robot, and for a beta after
+    the last joint.
     """
     robot = _in_base(robot)
     path = Path(source)
@@ -186,7 +186,7 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
     notes = require_same_arm(robot, read_ur_kinematics(path).robot, path)
     if robot.mdh[-1, 4]:
         raise InputError("robot", "beta6, which follows the last joint", "a robot with beta6 = 0")
-    origins, _, size = corrected(chain, robot.mdh, base=np.zeros(6))  # the base is said, also where the file had one
+    origins, _, size = corrected(chain, robot.mdh, base=np.zeros(6))  # the base is stated even if the file had one
     edits = {}
     for name, T, old in zip(JOINTS, origins, chain.origins, strict=True):
         texts = origin_numbers(T, old, size)

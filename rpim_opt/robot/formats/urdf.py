@@ -1,7 +1,7 @@
 """URDF: reading of a chain between two links, and writing of identified origins with all other bytes unchanged.
 
-A URDF is untrusted input. It goes through expat, which reports where in the file an element stands; document types, and
-with them entities and other files, are refused, as are macros (xacro), which are carried out.
+A URDF is untrusted input. It is parsed by expat, which reports the place of every element in the file; document types,
+and with them entities and other files, are refused, as are xacro macros, which would have to be expanded first.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from rpim_opt.robot.terms import Model, Term
 
 EXPANDED = "what ROS's command makes of it: xacro arm.urdf.xacro > arm.urdf"
 DEEPEST = 100  # how deep elements may be nested
-LARGEST_NUMBER = 1e6  # size [m or rad] that no number of an origin or axis reaches
-TURN = math.tau + 1e-3  # angle of an origin [rad] that none exceeds; degrees mostly do
+LARGEST_NUMBER = 1e6  # numbers of origins and axes are smaller [m or rad]
+TURN = math.tau + 1e-3  # angles of origins [rad] are at most this: degrees usually exceed it
 KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": ""}
 ATTRIBUTE = re.compile(rb"([^\s=/<>\"']+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")  # a tag: quoted values may hold a '>'
@@ -58,19 +58,19 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
 
     ``base @ MDH chain(q) @ tool`` is the transform from link ``base`` to link ``tip``, with q the file's joint values;
     `chain.describe` states the conventions. The chain goes up from the base to the links' common ancestor, through
-    reversed joints, and down to the tip: a camera in a head sees a hand. Fixed joints are part of base, links and tool;
-    limits are carried over (continuous joints, and limits that are left out or equal, have none). Angles are roll,
-    pitch, yaw, R = Rz Ry Rx, and an axis that is left out is x (wiki.ros.org/urdf/XML/joint). Gravity points along -z
-    of the chain's highest link and pulls at the masses that the file states; none where joints move the base itself.
+    reversed joints, and down to the tip: from a camera in the head to a hand, for instance. Fixed joints become part of
+    base, links and tool; joint limits are taken over (none for continuous joints, and if missing or equal). Angles are
+    roll, pitch, yaw, R = Rz Ry Rx; a missing axis means x (wiki.ros.org/urdf/XML/joint). Gravity points along -z of the
+    chain's highest link and acts on the stated masses; no masses are used if joints move the base itself.
 
-    ``base`` and ``tip`` name any two links, by default the root, and the only leaf below the base. InputError for
-    document types and entities, links or joints that are missing, twice or in a cycle, values that are no finite
+    ``base`` and ``tip`` name any two links; by default the root, and the only leaf below the base. InputError for
+    document types and entities, links or joints that are missing, duplicate or in a cycle, values that are not finite
     numbers, floating and planar joints between base and tip, no or several candidates for base or tip.
 
-    With ``origins`` the parameters to identify are not those of the table but the origins of the file's joints, six
-    numbers each, ``origin_{joint}_x`` to ``_rz``, of fixed joints at the chain's ends ``mount_{joint}_x``: the same in
-    every chain that a joint is part of, so that `together` shares them. A first row that does not move stands for the
-    base link then: the table starts in that link's own frame, and the file's first joint is number 2 in terms.
+    With ``origins``, the parameters are not those of the table but the origins of the file's joints, six numbers each:
+    ``origin_{joint}_x`` to ``_rz``, for fixed joints at the chain's ends ``mount_{joint}_x``. They have the same names
+    in every chain with that joint, so that `together` shares them. The table then has a first row without motion, for
+    the base link: it starts in that link's own frame, and the file's first joint is number 2 in terms.
 
     >>> import rpim_opt as ro
     >>> arm = ro.read_urdf("arm.urdf", base="base", tip="tip")
@@ -82,7 +82,7 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
     urdf = _read(Path(path))
     way = urdf.way(base, tip)
     chain, joint_map, offsets = way.chain, way.joint_map, way.offsets
-    if origins:  # a row that no joint moves stands before the others
+    if origins:  # a first row that no joint moves
         urdf.prefixes()
         chain = Chain(np.array([np.eye(4), *chain.origins]), np.array([[0.0, 0.0, 1.0], *chain.axes]), chain.tail)
         joint_map, offsets = (np.vstack([0 * numbers[:1], numbers]) for numbers in (joint_map, offsets))
@@ -134,13 +134,13 @@ def write_urdf(
     base_frame: Array | None = None,
     tool_frame: Array | None = None,
 ) -> list[str]:
-    """Write a URDF file with the origins that an identified robot has, every other byte as in the original.
+    """Write a URDF file with the origins of an identified robot, every other byte as in the original.
 
-    ``source`` is the original; its `read_urdf` with the same ``base`` and ``tip`` has to be the robot whose parameters
-    were identified. ``robot`` has these (`use.identified`), ``base_frame`` and ``tool_frame`` (6,) are identified base
-    and tool, x, y, z [m], roll, pitch, yaw [rad]; by default the original's. Numbers read back exactly. Returned
-    are sentences on joint values that the file counts otherwise than the controller, and on zeros of joints. Refused
-    are another robot, and a tool or last beta where no fixed joint follows the last moving one.
+    ``source`` is the original: its `read_urdf` with the same ``base`` and ``tip`` has to be the robot that was
+    calibrated. ``robot`` has the identified parameters (`use.identified`), ``base_frame`` and ``tool_frame`` (6,) are
+    identified base and tool, x, y, z [m], roll, pitch, yaw [rad]; by default the original's. Numbers read back exactly.
+    Return sentences on joint values that the file counts differently from the controller, and on joint zeros.
+    InputError for another robot, and for a tool or last beta if no fixed joint follows the last moving one.
     """
     urdf = _read(Path(source))
     way = urdf.way(base, tip)
@@ -148,10 +148,10 @@ def write_urdf(
     mimics = {name: joint.element.find("mimic") for name, joint in urdf.joints.items()}
     led = {name: mimic.get("joint", "") for name, mimic in mimics.items() if mimic is not None}
     for joint, old, new in zip(way.joints, way.joint_map, robot.joint_map, strict=False):
-        # of a joint that follows one that moves on its own, and that none follows
+        # a joint that mimics an independent joint, and that no joint mimics
         alone = joint.name in led and led[joint.name] not in led and joint.name not in led.values()
         if alone and not np.array_equal(old, new):
-            old[old != 0] = new[old != 0]  # the multiplier, and zeros
+            old[old != 0] = new[old != 0]  # the multiplier; zeros stay
             edits |= joint.edits(urdf.data, "mimic", {"multiplier": repr(float(old.sum()))})
     notes = require_same_arm(robot, replace(read_urdf(source, base, tip).robot, joint_map=way.joint_map), Path(source))
     origins, tail, size = corrected(way.chain, robot.mdh - way.offsets, base_frame, tool_frame)
@@ -179,8 +179,8 @@ def write_urdf(
 def write_origins(source: str | Path, deviations: Mapping[str, Array], target: str | Path) -> None:
     """Write a URDF file with displaced origins, every other byte as in the original.
 
-    ``deviations`` are six numbers each [m, rad], by the prefix of the parameters, ``origin_{joint}_``: x, y, z, roll,
-    pitch, yaw in the parent link's frame of what comes before the origin. Prefixes that no joint has are refused.
+    ``deviations`` maps the parameters' prefix, ``origin_{joint}_``, to (6,) [m, rad]: x, y, z, roll, pitch, yaw along
+    and about the axes of the parent link's frame. InputError for a prefix without a joint.
     """
     urdf = _read(Path(source))
     edits: dict[tuple[int, int], str] = {}
@@ -203,19 +203,19 @@ class _Step(NamedTuple):
     up: bool
     start: str
     end: str
-    constant: np.ndarray  # transform (4, 4) of its origin: before its motion, or after it where it is passed up
+    constant: np.ndarray  # its origin as a transform (4, 4): before its motion, after it if passed up
 
 
 class _Way(NamedTuple):
     """The steps from one link to another, and the n joints that move."""
 
     steps: Sequence[_Step]
-    parts: list[list[_Step]]  # whose origins stand before the first motion, between the motions and after the last one
+    parts: list[list[_Step]]  # rigid parts: steps before the first motion, between motions and after the last
     chain: Chain
     joints: list[_Joint]
-    names: tuple[str, ...]  # of the k joints that these follow
+    names: tuple[str, ...]  # of the k independent joints
     joint_map: Array  # (n, k)
-    offsets: Array  # (n, 5) of theta and d: a mimic joint is at multiplier times the followed joint's value plus offset
+    offsets: Array  # (n, 5) of theta and d: a mimic joint is at multiplier times the other's value plus offset
 
 
 def _taker(part: Sequence[_Step]) -> int:
@@ -342,7 +342,7 @@ class _Joint:
         lower, upper = (float(self._numbers("limit", which, "0", 1)[0]) for which in ("lower", "upper"))
         if lower > upper:
             raise self.error("limit", f"{lower:g} to {upper:g}", "lower < upper")
-        far = max(abs(lower), abs(upper)) > LARGEST  # some files write 1e16 for no limit
+        far = max(abs(lower), abs(upper)) > LARGEST  # some files state no limit as 1e16
         unlimited = far or lower == upper or self.element.get("type") == "continuous"
         return (-math.inf, math.inf) if unlimited else (lower, upper)
 
@@ -550,22 +550,22 @@ def _root_element(data: bytes) -> _Element:
 
 
 def _masses(urdf: _Urdf, way: _Way, table: Array, G: Array) -> Gravity:
-    """Return the mass that each row of the table carries up to the next, and its centre in the table's frames.
+    """Return the mass that each row of the table carries, up to the next row, and its centre in the table's frames.
 
-    Links beside the chain and beyond its tip, a gripper's for instance, hang where their joints are at zero; what
-    cannot be read there is left out. No masses where nothing that moves has one, or the base itself is moved.
+    Links off the chain and beyond its tip, such as a gripper's, count with their joints at zero; those that cannot be
+    read there are left out. No masses are returned if no moving link has one, or if joints move the base itself.
     """
     if any(step.up and step.joint.kind for step in way.steps):
         return Gravity()
-    first = len(table) - len(way.chain.axes)  # rows that no joint moves
-    frames = {way.steps[0].start: (first, np.eye(4))}  # the row (from 1; 0: none) that carries a link, and its place
+    first = len(table) - len(way.chain.axes)  # rows without motion
+    frames = {way.steps[0].start: (first, np.eye(4))}  # row that carries a link (from 1; 0: none), and its pose
     for step in way.steps:
         i, T = frames[step.start]
         frames[step.end] = (i + 1, np.eye(4)) if step.joint.kind else (i, T @ step.constant)
     masses = np.zeros(len(table))
     moments = np.zeros((len(table), 3))
     for name, body in urdf.links.items():
-        place = np.eye(4)  # of the link in that of the chain that carries it
+        place = np.eye(4)  # pose of the link in the chain link that carries it
         carrier = name
         try:
             while carrier not in frames and carrier in urdf.above:

@@ -3,8 +3,8 @@
 FANUC ``P[1:"name"]{ UF : 0, UT : 1, J1= 10.000 deg, ... };``; KUKA ``DECL E6AXIS XP1={A1 10.0,A2 -90.0,...}``; ABB
 ``CONST jointtarget P1:=[[10,-90,...],[9E9,...]];``; Universal Robots ``movej([0.1, -1.57, ...])`` and ``P1_q = [...]``
 in rad, ``p[...]`` in m and rad; Yaskawa ``C00000=10.0,-90.0,...`` below ``///POSTYPE ANGLE``; Kawasaki
-``#p1 10.0 -90.0 ...`` below ``.JOINTS``; Mitsubishi ``J1=(+10.00,-90.00,...)``; Staubli
-``<Value key="0" j1="10" j2="-90" ... />``. External axes are left out but the first of KUKA and ABB, E1.
+``#p1 10.0 -90.0 ...`` below ``.JOINTS``; Mitsubishi ``J1=(+10.00,-90.00,...)``; Staubli ``<Value key="0" j1="10"
+j2="-90" ... />``. Of external axes only E1 of KUKA and ABB is read.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ KUKA = re.compile(r"(?:(?:E6AXIS|AXIS|E6POS|POS|FRAME)\s+(\w+)\s*=|PTP|LIN)\s*\{
 ABB_JOINTS = re.compile(
     r"(?:jointtarget\s+(\w+)\s*:=|MoveAbsJ)\s*\[\s*\[([^\]]*)\](?:\s*,\s*\[([^\],]*))?", re.IGNORECASE
 )
-NO_AXIS = 9e9  # ABB's value of an external axis that is not there
+NO_AXIS = 9e9  # ABB's value of an absent external axis
 ABB_POSES = re.compile(r"(?:robtarget\s+(\w+)\s*:=|Move[JL])\s*\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]", re.IGNORECASE)
 UR = re.compile(rf"(?:(\w+)\s*=|move[jlp]\s*\()\s*(p?)\[\s*((?:{NUMBER}\s*,\s*){{5}}{NUMBER})\s*\]", re.IGNORECASE)
 YASKAWA = re.compile(r"^[ \t]*([BCP]+\d+)[ \t]*=[ \t]*([-+\d.][-+\d., \t]*)$", re.MULTILINE)
@@ -37,8 +37,8 @@ STAUBLI = re.compile(r"<(Data|Value)\s([^<>]{0,2000})>")
 PLACE = [f"commanded {axis} [mm]" for axis in "xyz"]
 TURN = [f"commanded q{part}" for part in "wxyz"]
 PAIR = re.compile(rf'\b([AJ]\d|E1|[XYZABCWPR])\s*[= ]\s*"?({NUMBER})(?:\s*(deg|mm))?', re.IGNORECASE)
-"""A joint, a coordinate or a turn that is stated by name."""
-LENGTHS = ("X", "Y", "Z", "E1")  # of these without a unit: the first external axis, if it is a joint, is a rail
+"""A joint, coordinate or rotation stated by name."""
+LENGTHS = ("X", "Y", "Z", "E1")  # lengths if without a unit: an external axis that is a joint is taken for a rail
 Target = tuple[str, Mapping[str, str]]
 
 
@@ -120,9 +120,9 @@ def read_yaskawa(text: str) -> Rows:
 
 
 def read_staubli(text: str) -> Rows:
-    """Return the points by their keys, numbered from 0 without keys; of several arrays as ``array[key]`` or ``array``.
+    """Return the points, named by their key, or numbered from 0 without keys.
 
-    The latter of an array of one point.
+    If a file has several arrays, names are ``array[key]``, and ``array`` for one with a single point.
     """
     array, i = "", 0
     targets = []

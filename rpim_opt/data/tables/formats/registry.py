@@ -18,14 +18,14 @@ Rows = Sequence[Mapping[str, Any]]
 """Cells by the names of their columns, with units as in headers: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
 
 NO_TABLES = (".pdf", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl", ".py", ".ipynb")
-"""Endings of files that are no tables as text; any other unknown ending may be one of an instrument's table."""
+"""Endings of files that are no text tables; any other unknown ending may be an instrument's."""
 
 
 class TableFormat(NamedTuple):
     """A format of tables: a module of this folder lists its own in ``FORMATS``.
 
-    ``endings`` are those of its files, and ``read(text)`` returns the rows, none of a text of another format with such
-    an ending. What a program commands is called so, ``commanded x [mm]``: no measurement.
+    ``endings`` are those of its files; ``read(text)`` returns the rows, or none for a text of another format with the
+    same ending. Values that a program commands are so named, ``commanded x [mm]``: they are no measurements.
     """
 
     name: str

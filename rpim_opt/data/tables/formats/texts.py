@@ -16,7 +16,7 @@ from rpim_opt.basics.units import split
 from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
 MESSAGE = re.compile(r"^name: *\[[^\]]*\]\nposition: *\[", re.MULTILINE)
-"""What `rostopic echo` and `ros2 topic echo --flow-style` print of joint states."""
+"""Joint states as printed by `rostopic echo` and `ros2 topic echo --flow-style`."""
 MATRIX = re.compile(
     r"(?:%([^\n]*)\n\s*)?^[ \t]*(\w+)[ \t]*=[ \t]*\[([^\]]*)\][ \t]*;?[ \t]*(?:%([^\n]*))?", re.MULTILINE
 )
@@ -87,7 +87,7 @@ def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
     joints = value.get("name")
     for name, part in value.items():
         if isinstance(joints, list) and isinstance(part, list):
-            # ROS: lists of values beside one of names, in whatever order
+            # ROS: lists of values parallel to a list of names, in any order
             topic = f"/{prefix}" if prefix else ""
             if part is not joints:
                 yield from ((f"{topic}/{joint}/{name}", cell) for joint, cell in zip(joints, part, strict=False))
