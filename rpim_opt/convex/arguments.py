@@ -65,7 +65,7 @@ class Deviations:
 class Arguments(Identified):
     """The identified parameters as the argument of a constraint function, with z (n,) and quantities affine in it.
 
-    Other arguments as for `Parameters`; ``nonlinear`` notes positions that were used, which are linear about a point.
+    Other arguments as for `Parameters`; ``nonlinear`` records the linearized positions that a function used.
     """
 
     z: Any = None
@@ -81,10 +81,10 @@ class Arguments(Identified):
     ) -> cp.Expression:
         """Return predicted positions (N, 3) [m] in the instrument's frame, affine in z.
 
-        To first order about the solution: a calibration is repeated about what it found until that is so. q (N, dof)
-        are joint values of the controller [rad or m]; ``marker`` is the reflector, the only one by default
-        (InputError where there are several); ``torque`` (N, dof) joint torques [Nm], where compliance is identified
-        from measured ones; ``robot`` one of several.
+        They are linearized; the calibration repeats until linearization and solution agree. q (N, dof) are joint values
+        of the controller [rad or m]; ``marker`` is the reflector (InputError if there are several and none is given);
+        ``torque`` (N, dof) are joint torques [Nm], needed if compliance is identified from measured ones; ``robot`` is
+        one of several.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -122,7 +122,7 @@ def problem_of(p: Arguments) -> CalibrationProblem:
 def every_movement(p: Arguments, q: Array) -> Predicted:
     """Return displacements (M, 3) [m] of every reflector by the robot's parameters, and their slopes (M, 3, n) by z.
 
-    Deviations of frames (base, reflector) do not count: they say where things stand, not how the robot is.
+    Deviations of frames (base, reflector) are left out: they are no property of the robot.
     """
     problem = problem_of(p)
     movements = [moved(problem, q, marker, at=p.at) for marker in markers(problem)]

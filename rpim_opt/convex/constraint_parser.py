@@ -19,14 +19,14 @@ ACCEPTED = {
     "'d5 +- 0.1 mm'",
 }
 LONGEST = 20_000
-"""Characters of a statement: some thousand parameters."""
+"""Largest number of characters of a statement: some thousand parameters."""
 DIMENSIONS = ("length", "angle", "ratio", "compliance")
-"""Dimensions that parameters have."""
+"""Dimensions of parameters."""
 Kind = Literal["equal", "most", "within", "norm", "move"]
-_NUMBER = r"(?:\d++\.?+\d*+|\.\d++)(?:[eE][+-]?+\d++)?+"  # possessive: read in linear time
+_NUMBER = r"(?:\d++\.?+\d*+|\.\d++)(?:[eE][+-]?+\d++)?+"  # possessive: matched in linear time
 _PARAMETER = re.compile(r"[\w.-]+")
 _NAME = r"[A-Za-z_](?:[\w.*?]|\[[^\]]*\])*"
-_TOOL = r"(?:\w+\.)?tool(?:(?!_r?[xyz]\b)[\w.*?-])*_r?[xyz]\b"  # a reflector's name may have a hyphen: tool_SMR-A_x
+_TOOL = r"(?:\w+\.)?tool(?:(?!_r?[xyz]\b)[\w.*?-])*_r?[xyz]\b"  # a reflector's name may contain a hyphen: tool_SMR-A_x
 _SIGN = r"\+-|±|<=|>=|≤|≥|==|[-+*=|(),]"
 _TOKEN = re.compile(rf"\s*(?:(?P<number>{_NUMBER})|(?P<name>{_TOOL}|{_NAME})|(?P<sign>{_SIGN}))")
 _MOVE = re.compile(r"\s*move\b(?:\s+at\s+most\b)?([^:]*)(?::(.*))?")
@@ -37,7 +37,7 @@ _SIGNS = {"±": "+-", "≤": "<=", "≥": ">=", "==": "="}
 class Sum:
     """A sum of factors times parameters' values and a constant [SI].
 
-    ``nominal`` is not zero where the parameters count from their nominal values; names may be patterns.
+    ``nominal`` is the factor on the nominal value of the sum, which is added; names may be patterns.
     """
 
     names: tuple[str, ...] = ()
@@ -56,9 +56,9 @@ class Sum:
 class Sentence:
     """A constraint in words.
 
-    ``kind`` is ``equal`` (every sum is zero), ``most`` (none is above zero), ``within`` (none is larger than the
-    limit), ``norm`` (all together are not) or ``move`` (no predicted movement at ``places`` is). ``limit`` is in SI,
-    ``unit`` as written, empty where no number had one.
+    ``kind`` is ``equal`` (every sum is zero), ``most`` (every sum is at most zero), ``within`` (every sum's absolute
+    value is at most the limit), ``norm`` (the norm of all sums is) or ``move`` (every predicted movement at ``places``
+    is). ``limit`` is in SI units, ``unit`` as written, empty if no number had one.
     """
 
     kind: Kind
@@ -71,8 +71,8 @@ class Sentence:
 def sentence(text: str) -> Sentence:
     """Parse a constraint.
 
-    InputError for other words and signs, numbers without a unit, units of different dimensions, and demands that are
-    not convex.
+    InputError for unknown words and signs, numbers without a unit, units of different dimensions, and constraints that
+    are not convex.
 
     >>> from rpim_opt.convex.constraint_parser import sentence
     >>> found = sentence("d2 + d3 = 850.00 +- 0.05 mm")
@@ -88,7 +88,7 @@ def sentence(text: str) -> Sentence:
 def combination(text: str) -> Sentence:
     """Parse a known value: a sum that is zero ``within`` its standard deviation, which is the limit.
 
-    InputError for numbers without a unit, and for a standard deviation that is not above zero.
+    InputError for numbers without a unit, and a standard deviation that is not positive.
 
     >>> from rpim_opt.convex.constraint_parser import combination
     >>> known = combination("a2 - 0.5 a3 = nominal + 0.2 +- 0.05 mm")
@@ -130,7 +130,7 @@ class _Reader:
                 raise self._wrong(f"unit '{each}'", choices(each, units()))
         if len({UNITS[each].dimension for each in named}) > 1:
             raise self._wrong(f"units {' and '.join(named)}", "units of one dimension")
-        self.unit = named[-1] if named else ""  # of numbers that have none of their own
+        self.unit = named[-1] if named else ""  # for numbers without their own
 
     def _wrong(self, found: str, accepted: str = "") -> InputError:
         accepted = accepted or f"a statement like {ACCEPTED[self.what]}"

@@ -37,29 +37,29 @@ __all__ = [
 ]
 
 Constraint = Callable[[Any, Parameters], Any]
-"""From z and the identified parameters to a CVXPY constraint, or several."""
+"""Function of z and the identified parameters that returns one or several CVXPY constraints."""
 
 WORKSPACE, BOX = "workspace", ("x", "y", "z")
-"""The place that every robot has, all its joint ranges; and what a box is given by."""
+"""The predefined place, all joint ranges; and the keys of a box."""
 FAR = 100.0
-"""Prior scales by which a stated value may differ from nominal: beyond, its unit or its meaning is wrong."""
+"""Largest difference of a stated value from nominal, in prior scales: beyond, its unit or meaning is wrong."""
 
 Limits = Callable[[Parameters], tuple[Array, Array]]
-"""From the identified parameters to lower and upper bounds (n,) of z."""
+"""Function of the identified parameters that returns lower and upper bounds (n,) of z."""
 
 
 @dataclass(frozen=True)
 class Ready:
-    """A function made by the package, which is compared and stored by its maker and arguments.
+    """A function made by the package, compared and stored by the name and arguments of its ``maker``.
 
-    ``function`` gets what it is called with, and the ``arguments`` of its ``maker``.
+    ``function`` is called with its own arguments, followed by the maker's ``arguments``.
     """
 
     maker: str
     function: Callable[..., Any]
     arguments: tuple[Any, ...]
     quadratic: ClassVar[Any] = None
-    """The quadratic of its argument that a penalty declares to be, where it knows that exactly."""
+    """The exact quadratic form of a penalty, if it declares one."""
 
     def __post_init__(self) -> None:
         for argument in self.arguments:
@@ -88,7 +88,7 @@ def name_of(function: Any, k: int) -> str:
         return str(name)
     code = getattr(function, "__code__", None)
     known = [place for place in (code.co_positions() if code else ()) if None not in place]
-    places = [place for place in known if place[::2] < place[1::2]]  # from line and byte to line and byte
+    places = [place for place in known if place[::2] < place[1::2]]  # pairs (line, byte) of begin and end
     lines = linecache.getlines(code.co_filename) if code and places else []
     if not lines:
         return f"constraint {k + 1}"
@@ -108,9 +108,9 @@ def as_text(deviation: float, dimension: str) -> str:
 
 @dataclass(frozen=True)
 class Box:
-    """A constraint lower <= z <= upper; with squared loss and penalty an active set solves it to rounding.
+    """A constraint lower <= z <= upper; with squared loss and penalty, an active-set method solves it to rounding.
 
-    ``limits`` returns lower and upper bounds (n,) of the identified `Parameters`, infinite where there is none.
+    ``limits`` returns lower and upper bounds (n,) for the identified `Parameters`, infinite where there is none.
 
     >>> import cvxpy as cp
     >>> import numpy as np
@@ -150,7 +150,7 @@ class Box:
         """Return the CVXPY constraints."""
         lower, upper = self.bounds(parameters)
         fixed, low, high = (np.flatnonzero(side) for side in box_sides(lower, upper))
-        made = []  # CVXPY before 1.8 knows no empty expression
+        made = []  # CVXPY before 1.8 has no empty expression
         if len(fixed):
             made.append(z[fixed] == lower[fixed])
         if len(low):
@@ -175,7 +175,7 @@ def _tolerances(parameters: Parameters) -> tuple[Array, Array]:
 
 
 within_tolerance = Box("within tolerance", _tolerances)
-"""|x_i| <= tolerance_i, where a tolerance is stated; InputError where none is.
+"""|x_i| <= tolerance_i for all stated tolerances; InputError if none is stated.
 
 >>> import rpim_opt as ro
 >>> parameters = ro.load("paper_arm").problem.parameters.free
@@ -186,7 +186,7 @@ within_tolerance = Box("within tolerance", _tolerances)
 
 
 def at_nominal(*patterns: str) -> Box:
-    """Keep the parameters that match one of the patterns at their nominal values: z_i = 0.
+    """Fix the parameters that match one of the patterns at their nominal values: z_i = 0.
 
     >>> import cvxpy as cp
     >>> import rpim_opt as ro
@@ -206,7 +206,7 @@ def _at_nominal(parameters: Parameters, *patterns: str) -> tuple[Array, Array]:
 
 
 def signed(sign: int, *patterns: str) -> Box:
-    """Keep the deviations that match one of the patterns on one side: sign z_i >= 0, with sign +1 or -1.
+    """Restrict the sign of deviations that match one of the patterns: sign z_i >= 0, with sign +1 or -1.
 
     >>> import cvxpy as cp
     >>> import rpim_opt as ro
@@ -259,7 +259,7 @@ def _equal(z: Any, parameters: Parameters, *names: str) -> Any:
 
 
 def in_ball(radius: float, *patterns: str) -> Constraint:
-    """Keep the deviations that match one of the patterns in a ball: |z| <= radius, in units of the scales.
+    """Restrict the deviations that match one of the patterns to a ball: |z| <= radius, in units of the scales.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -297,7 +297,7 @@ def _grouped(parameters: Parameters, key: Callable[[str], str]) -> list[Array]:
 def by_link(parameters: Parameters) -> list[Array]:
     """Group the parameters by link (``alpha3, a3, theta3, d3``) and by frame (``base``, ``tool``).
 
-    Returns matrices D_k (n_k, n) that pick the groups, for ``penalty_over`` of a `Formulation`.
+    The function returns matrices D_k (n_k, n) that select the groups, for ``penalty_over`` of a `Formulation`.
 
     >>> import rpim_opt as ro
     >>> parameters = ro.load("position").problem.parameters.free
@@ -310,7 +310,7 @@ def by_link(parameters: Parameters) -> list[Array]:
 
 
 def by_kind(parameters: Parameters) -> list[Array]:
-    """Group the parameters by kind (all ``alpha``, all ``a``, ...), as `by_link` does by link: D_k (n_k, n).
+    """Group the parameters by kind (all ``alpha``, all ``a``, ...), with matrices D_k (n_k, n) as of `by_link`.
 
     >>> import rpim_opt as ro
     >>> parameters = ro.load("position").problem.parameters.free
@@ -323,8 +323,8 @@ def by_kind(parameters: Parameters) -> list[Array]:
 def differences(*patterns: str) -> Callable[[Parameters], list[Array]]:
     """Penalize differences of neighbouring links (total variation with ``cp.sum``), and other parameters themselves.
 
-    For parameters of consecutive joints that share a cause: ``differences("ratio?")``, one scale of all encoders. The
-    function that it returns gives rows D_k (1, n), for ``penalty_over`` of a `Formulation`.
+    Intended for parameters of consecutive joints with a common cause: ``differences("ratio?")`` for one scale of all
+    encoders. The returned function gives rows D_k (1, n), for ``penalty_over`` of a `Formulation`.
 
     >>> import rpim_opt as ro
     >>> parameters = ro.load("position").problem.parameters.identify(["d[12]", "ratio?"]).free
@@ -476,9 +476,9 @@ class Parsed:
         return E, f, size
 
     def _rows(self, found: Sum, p: Arguments) -> Iterator[tuple[Array, float]]:
-        """Yield a sum as a row (n,) and a number [SI], one for every identified parameter that its pattern matches.
+        """Yield a sum as a row (n,) and a number [SI], once for every identified parameter that matches its pattern.
 
-        Parameters that are not identified are nominal.
+        Parameters that are not identified have their nominal values.
         """
         table, unit = whole(p), self.demanded.unit
         patterns = [name for name in found.names if name not in table.names]
@@ -504,7 +504,7 @@ class Parsed:
                     row[p.names.index(name)] += factor * p.scale[p.names.index(name)]
                 if found.nominal:
                     continue
-                if table.of_frames[i] and table.periodic[i] and table.nominal[i] != 0:  # its deviations are rotations
+                if table.of_frames[i] and table.periodic[i] and table.nominal[i] != 0:  # then deviations are rotations
                     what = f"the value of '{name}', an angle of a rotated frame"
                     raise self._wrong(what, "its deviation: '= nominal +- 0.1 mrad'")
                 constant += factor * table.nominal[i]
@@ -512,23 +512,23 @@ class Parsed:
 
 
 def parse(text: str, where: Mapping[str, Any] | None = None) -> Parsed:
-    """Parse a constraint from text: values of parameters with units, or a limit on the robot's movement.
+    """Parse a constraint on parameter values with units, or a limit on the robot's movement.
 
     ::
 
         d2 + d3 = 850.00 +- 0.05 mm       |d2 + d3 - 850 mm| <= 0.05 mm; = without +- is an equality
-        |a2 - a3| <= 0.1 mm               |a? - nominal| <= 0.2 mm, one for every a
+        |a2 - a3| <= 0.1 mm               |a? - nominal| <= 0.2 mm, for every a
         alpha2 >= 89.9 deg                89.9 deg <= alpha2 <= 90.1 deg
-        d5 = nominal +- 0.1 mm            of the deviation
+        d5 = nominal +- 0.1 mm            on the deviation
         norm(tool_x - 10 mm, tool_y) <= 0.05 mm
         move at most 5 mm: workspace      |p(q; x) - p(q; 0)| at every q of a place
 
-    Parameters that are not identified are nominal. A movement is that of the robot's own parameters, not of frames,
-    at 64 configurations of a box or of all joint ranges (``workspace``); to first order about the solution.
+    Parameters that are not identified have their nominal values. Movements are caused by the robot's own parameters,
+    not by frames: linearized about the solution, at 64 configurations of a box or of all joint ranges (``workspace``).
 
-    ``where`` has places by name: joint values (dof,) or (N, dof) [rad or m], or a box ``{"x": (low, high), "y": ...,
-    "z": ...}`` [m] in the robot's base frame. InputError for anything else, units that do not fit, demands that are not
-    convex; when it is posed, for names that the problem has not. The text is parsed, and never evaluated.
+    ``where`` maps places to joint values (dof,) or (N, dof) [rad or m], or to a box ``{"x": (low, high), "y": ..., "z":
+    ...}`` [m] in the robot's base frame. InputError for anything else, units that do not fit and constraints that are
+    not convex, and, once the program is posed, for unknown parameters. The text is parsed, never evaluated.
 
     >>> import cvxpy as cp
     >>> import numpy as np

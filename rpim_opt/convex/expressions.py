@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     import cvxpy as cp
 else:
 
-    class _Late(ModuleType):  # CVXPY, imported when something of it is first used
+    class _Late(ModuleType):  # CVXPY, imported at first use
         def __getattr__(self, name: str) -> Any:
-            if name.startswith("__"):  # what doctest and inspect ask of every module is no use of it
+            if name.startswith("__"):  # doctest and inspect ask every module for such names: no use
                 raise AttributeError(name)
             value = vars(self)[name] = getattr(import_module(self.__name__), name)
             return value
@@ -59,7 +59,7 @@ ATOMS = (SQUARES, SUM, LARGEST, NORM1, NORM2)
 def named(function: Callable[..., Any] | None) -> Callable[..., Any] | None:
     """Return a function of CVXPY as an `Atom`; any other function unchanged."""
     module = sys.modules.get("cvxpy")
-    if module is None:  # then no function of it is in use
+    if module is None:  # then none of its functions is in use
         return function
     for atom in ATOMS:
         if function is getattr(module, atom.name, None):
@@ -137,7 +137,7 @@ def substituted(stated: Any, instead: Mapping[int, Any]) -> Any:
     """Return a copy of an expression or constraint with other leaves, by the ``id`` of those that they replace."""
     if id(stated) in instead:
         return instead[id(stated)]
-    kind = type(stated)  # of three kinds CVXPY's ``tree_copy`` loses arguments
+    kind = type(stated)  # for three types CVXPY's ``tree_copy`` loses arguments
     if kind.__name__ == "indicator":
         return kind([substituted(limit, instead) for limit in stated.args], stated.err_tol)
     if kind.__name__ == "perspective":
@@ -176,7 +176,7 @@ class Frozen:
             self._instead[id(variable)] = made
             self.own.append(made)
         if not self._instead.keys() & {id(leaf) for leaf in [*stated.parameters(), *stated.variables()]}:
-            return stated  # nothing of it may change later; CVXPY knows its convexity already
+            return stated  # it is constant from here on; CVXPY has determined its convexity
         return substituted(stated, self._instead)
 
 
@@ -189,14 +189,14 @@ def _domain(expression: Any) -> list[Any]:
 
 
 OF_NUMPY = ("You're calling a NumPy function on a CVXPY expression", "unexpected keyword argument 'out'")
-"""Errors of CVXPY's expressions in functions of NumPy; ``np.sum`` calls their method ``sum``."""
+"""Errors of NumPy functions applied to CVXPY expressions; ``np.sum`` calls their method ``sum``."""
 
 
 def called(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
     """Call a user's function, and turn its errors into an InputError."""
     try:
         return function(*arguments)
-    except (cp.SolverError, NotImplementedError) as error:  # of atoms that call a solver, and strict inequalities
+    except (cp.SolverError, NotImplementedError) as error:  # by atoms that call a solver, and strict inequalities
         raise InputError(where, f"{error}".rstrip("."), "expressions of CVXPY, with <=, >= or ==") from error
     except (TypeError, RuntimeError) as error:
         if any(text in str(error) for text in OF_NUMPY):
@@ -204,7 +204,7 @@ def called(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
             raise InputError(where, "a NumPy function of a CVXPY expression", accepted) from error
         if isinstance(error, RuntimeError):
             raise
-        if error.__traceback__ is None or error.__traceback__.tb_next is not None:  # of the function's own code
+        if error.__traceback__ is None or error.__traceback__.tb_next is not None:  # raised in the function's own code
             raise
         constraint = "z and the parameters, lambda z, p: cp.norm1(z) <= 5"
         accepted = f"a function of {constraint if len(arguments) == 2 else 'one argument'}"
@@ -218,7 +218,7 @@ Evaluation = Callable[[Any], tuple[Any, Any]]
 def evaluation(e: Any, v: Any, slopes: bool = True) -> Evaluation:
     """Return a function that evaluates an expression at values of a variable, four times as fast as ``e.value``.
 
-    With ``slopes`` by forward differentiation: entry i of every part depends on v_i alone.
+    With ``slopes`` it differentiates in forward mode; entry i of every subexpression depends on v_i alone.
     """
     if e is v:
         return lambda x: (x, 1.0)
@@ -270,7 +270,7 @@ def _by_cvxpy(e: Any, values: Sequence[Any], _: Any) -> list[Any]:
 
 
 def _of_maximum(_: Any, values: Sequence[Any], value: Any) -> list[Any]:
-    free: Any = True  # where none of those before is the largest
+    free: Any = True  # where none of the previous ones is the largest
     parts = []
     for each in values:
         largest = free & (each == value)
@@ -298,7 +298,7 @@ DERIVATIVES: dict[str, Callable[[Any, Any, Any], list[Any]]] = {
     "exp": lambda e, values, value: [value],
     "norm": lambda e, values, value: [each / np.maximum(value, 1e-300) for each in values],
 }
-"""Partial derivatives of the atoms that losses are mostly made of, from their parts' values and their own."""
+"""Partial derivatives of the most frequent atoms of losses, from the values of their arguments and their own."""
 
 
 class Term:
@@ -314,7 +314,7 @@ class Term:
         """Return the value; infinite outside the domain."""
         with self._lock, np.errstate(all="ignore"):
             self.variable.save_value(value)
-            if any(np.any(limit.violation() > 0) for limit in self._domain):  # 1 / x is a number there, no atom's
+            if any(np.any(limit.violation() > 0) for limit in self._domain):  # 1 / x still is a number
                 return float("inf")
             result = self._evaluated(value)[0]
         if result is None or not np.isfinite(result):
@@ -326,7 +326,7 @@ class Term:
         with self._lock:
             self.variable.save_value(value)
             gradient: Any = None
-            # atoms without a gradient raise NotImplementedError (norm_inf) or, by a fault in CVXPY, ValueError (cummax)
+            # NotImplementedError if an atom has no gradient (norm_inf), ValueError by a fault in CVXPY (cummax)
             with np.errstate(all="ignore"), contextlib.suppress(NotImplementedError, ValueError):
                 gradient = self.expression.grad.get(self.variable)
         if scipy.sparse.issparse(gradient):
@@ -349,7 +349,7 @@ def minimized(problem: cp.Problem, **settings: float) -> bool:
         warnings.simplefilter("ignore", UserWarning)
         problem.solve(solver=cp.CLARABEL, **settings)
         return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
-    return False  # the status is that of the solution before
+    return False  # the status refers to the previous solution
 
 
 def norms(r: Any, group: np.ndarray) -> Any:

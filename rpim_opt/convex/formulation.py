@@ -17,9 +17,9 @@ from rpim_opt.robot.parameters import Parameters
 
 Function = Callable[[Any], Any]
 HUBER = 2.0
-"""Whitened norm of a configuration from which Huber's loss grows linearly: a quarter of good positions lie beyond."""
+"""Whitened norm of a configuration above which Huber's loss is linear: a quarter of good positions exceed it."""
 NAMED = (*ATOMS, by_link, by_kind)
-"""Functions that mean the same whenever they are asked, besides those that are `Ready`."""
+"""Functions whose result does not change between calls, besides those that are `Ready`."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -30,14 +30,14 @@ class Formulation(Brief):
 
         minimize    loss(A z - b) + weight * penalty(z)     subject to    constraints(z)
 
-    The functions may hold variables and parameters of their own, and read whatever they like: a calibration calls them
-    twice, for its iterations and for its certificate; twice a round where constraints use positions. Of data in blocks
+    The functions may hold variables and parameters of their own, and read anything: a calibration calls them twice, for
+    its iterations and for its certificate, and twice per iteration if constraints use positions. With data in blocks
     the loss is called in every linearization, for some thousand rows at a time, and not for the certificate.
 
     Parameters
     ----------
     name
-        What reports call it.
+        Name in reports.
     loss
         Convex function of the whitened residual (m,); the sum of squares by default.
     penalty
@@ -46,14 +46,14 @@ class Formulation(Brief):
         Functions of z and of the identified `Parameters`, each returning a CVXPY constraint or several.
     loss_over
         ``"equation"``, or ``"configuration"``: the loss then gets the whitened norm of each configuration (N,), and
-        has to be nondecreasing.
+        has to be nondecreasing in it.
     penalty_over
         A function of the identified `Parameters` that returns matrices D_k: the penalty then gets the norms
         |D_k z| (K,), and has to be nondecreasing. `by_link`, `by_kind`, `differences`.
     solvable
-        False for one that was read from a file, which cannot hold a script's functions.
+        False if read from a file that cannot hold a script's functions.
 
-    InputError for another ``loss_over``, and what is no function; when it is posed, for a program that is not convex.
+    InputError for another ``loss_over`` and for arguments that are not callable; once posed, if it is not convex.
 
     Examples
     --------
@@ -108,7 +108,7 @@ class Formulation(Brief):
     def ready(self) -> bool:
         """Whether all its functions are the package's own, whose result does not change between calls."""
         functions = [self.loss, self.penalty, self.penalty_over, *self.constraints]
-        # of a box what matters are its limits
+        # a box is compared by its limits
         functions = [getattr(f, "limits", f) for f in functions if f is not None and f != within_tolerance]
         return all(isinstance(f, Ready) or f in NAMED for f in functions)
 
@@ -130,8 +130,8 @@ def unavailable(name: str) -> Callable[..., Any]:
 def huber(threshold: float = HUBER) -> Function:
     """Return Huber's loss (1964): v^2 up to the threshold, 2 threshold |v| - threshold^2 beyond, summed.
 
-    ``threshold`` is in sigmas: of an equation, or with ``loss_over="configuration"`` of a configuration's norm.
-    InputError for one that is not above zero.
+    ``threshold`` is in standard deviations: of an equation, or with ``loss_over="configuration"`` of a configuration's
+    norm. InputError if it is not positive.
 
     >>> import cvxpy as cp
     >>> import rpim_opt as ro
@@ -146,11 +146,11 @@ def huber(threshold: float = HUBER) -> Function:
 
 
 least_squares = Formulation("least squares")
-"""|A z - b|^2, the linear least squares of every textbook. It needs no weight, and independent parameters."""
+"""|A z - b|^2: linear least squares, without a weight; the parameters have to be independent."""
 tikhonov = Formulation("Tikhonov", penalty=SQUARES)
-"""|A z - b|^2 + weight |z|^2 (Tikhonov 1963): deviations are expected about as large as their scales."""
+"""|A z - b|^2 + weight |z|^2 (Tikhonov 1963): expects deviations of about the size of their scales."""
 bounded = Formulation("bounded Tikhonov", penalty=SQUARES, constraints=(within_tolerance,))
-"""`tikhonov` with |x_i| <= tolerance_i, where a tolerance is stated.
+"""`tikhonov` with |x_i| <= tolerance_i for all stated tolerances.
 
 >>> import rpim_opt as ro
 >>> problem = ro.load("paper_arm").problem
@@ -159,7 +159,7 @@ bounded = Formulation("bounded Tikhonov", penalty=SQUARES, constraints=(within_t
 True
 """
 robust = Formulation("Huber", loss=huber(), penalty=SQUARES, loss_over="configuration")
-"""`huber` of the norms of the configurations, + weight |z|^2: blunders hardly pull the fit, and are flagged.
+"""`huber` of the norms of the configurations, + weight |z|^2: outliers have little influence, and are flagged.
 
 >>> import rpim_opt as ro
 >>> result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=ro.reml)
@@ -176,14 +176,14 @@ sum_of_norms = Formulation("sum of norms", loss=SUM, penalty=SQUARES, loss_over=
 ['T8-6: 38 mm', 'T8-7: 15 mm']
 """
 minimax = Formulation("minimax", loss=LARGEST, penalty=SQUARES, loss_over="configuration")
-"""max_k |r_k| over the configurations, + weight |z|^2: the worst configuration counts, and nothing else does.
+"""max_k |r_k| over the configurations, + weight |z|^2: only the largest residuals count.
 
 >>> import rpim_opt as ro
 >>> print(f"{1e3 * ro.calibrate(ro.load('position').problem, ro.minimax, weight=1e-3).errors().max():.3f} mm")
 0.060 mm
 """
 lasso = Formulation("lasso", penalty=NORM1)
-"""|A z - b|^2 + weight |z|_1 (Tibshirani 1996): parameters that the data do not ask for stay nominal.
+"""|A z - b|^2 + weight |z|_1 (Tibshirani 1996): parameters that the data do not require stay nominal.
 
 >>> import rpim_opt as ro
 >>> result = ro.calibrate(ro.load("position").problem, ro.lasso, weight=5.0)

@@ -12,7 +12,7 @@ from rpim_opt.convex.expressions import cp, minimized, substituted
 from rpim_opt.convex.structure import Structure
 
 LEAST = 1e-6
-"""Slacks below this are the solver's accuracy."""
+"""Slacks below this are within the solver's accuracy."""
 
 
 class Condition(NamedTuple):
@@ -25,16 +25,16 @@ class Condition(NamedTuple):
 def conflict(structure: Structure) -> Conflict | None:
     """Return the contradiction; None if the constraints are feasible after all.
 
-    ``constraints`` is irreducible: without any one of them the others can be met (deletion filter; Chinneck and
-    Dravnieks 1991, ORSA Journal on Computing 3:157). By how much others would have to give way is the least sum of
-    slacks, of one kind at a time.
+    ``constraints`` is irreducible: without any one of them the others are feasible (deletion filter; Chinneck and
+    Dravnieks 1991, ORSA Journal on Computing 3:157). The loosening that resolves it has the least sum of slacks, of one
+    kind of constraint at a time.
     """
     z = cp.Variable(structure.n)
     conditions = _conditions(structure, z)
     if _possible(conditions):
         return None
     left = list(conditions)
-    for condition in conditions:  # leave out, one after the other, what is not needed for the contradiction
+    for condition in conditions:  # drop in turn what the contradiction does not need
         others = [other for other in left if other is not condition]
         if not _possible(others):
             left = others
@@ -69,9 +69,9 @@ def _possible(conditions: list[Condition]) -> bool:
 
 
 def _conditions(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any = 0) -> list[Condition]:
-    """Return what every constraint function demands, bound by bound.
+    """Return the conditions of every constraint function, bound by bound.
 
-    Loosened by slacks of boxes [scales], and of statements in words [scales of each].
+    They are loosened by slacks of ``boxes`` [scales] and of ``statements`` in words [scales of each].
     """
     parameters, stated = structure.parameters, structure.formulation
     made: list[Condition] = []

@@ -27,22 +27,22 @@ from rpim_opt.convex.structure import TIGHT, Structure, structure
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, reduced_rows
 
 ACTIVE = 1e-7
-"""Part of the largest multiplier from which a constraint is active."""
+"""A constraint is active if its multiplier is above this part of the largest one."""
 TOUCHING = 1e-9
-"""Distance from a bound, in scales, at which a component counts as lying on it."""
+"""A component this close to a bound, in scales, is at the bound."""
 SOFTEST = 1e-8
-"""Part of the objective that counts as the least curvature where the weight is smaller."""
+"""Least curvature, as part of the objective, assumed for smaller weights."""
 WELL_CONDITIONED = 1e-6
-"""Reciprocal condition number above which a triangular factor is solved with."""
+"""Reciprocal condition number above which triangular factors are used for solving."""
 PROXIMAL = 1e-2, 1e-4, 1e-6
-"""Sizes of the proximal term after the first."""
+"""Weights of the proximal term after the first one."""
 STATUS = {
     "PrimalInfeasible": "infeasible",
     "AlmostPrimalInfeasible": "infeasible_inaccurate",
     "DualInfeasible": "unbounded",
     "AlmostDualInfeasible": "unbounded",
 }
-"""CVXPY's words for Clarabel's."""
+"""CVXPY's status for Clarabel's."""
 
 TRCON: Any = get_lapack_funcs("trcon", dtype=float)
 
@@ -54,9 +54,9 @@ def feasibility_tolerance(z: Array) -> float:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Estimate(Brief):
-    """One solution: z (n,) at a weight, with the two values that the L-curve plots.
+    """A solution z (n,) at a weight, with loss and penalty, the coordinates of the L-curve.
 
-    ``status`` is CVXPY's word; zero ``iterations``: a formula, or an active set.
+    ``status`` is CVXPY's; ``iterations`` are zero for a closed form or an active-set method.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -82,7 +82,7 @@ class Estimate(Brief):
     def duals(self) -> tuple[Array, ...]:
         """Multipliers of the formulation's constraints, one array each, (n,) for a `Box`.
 
-        By how much the objective would fall if the constraint were loosened by one unit of the scales.
+        The rate at which the objective falls as the constraint is loosened, per unit of the scales.
         """
         return self.multipliers()
 
@@ -107,18 +107,18 @@ class Program(Brief):
     >>> [round(e.penalty, 1) for e in program.path([0.5, 5.0, 50.0])]
     [13.4, 12.5, 10.4]
     >>> there = program.on(problem.linearize(estimate.z * problem.parameters.free.scale))
-    >>> round(estimate.loss), round(there.value(estimate.z)[0])  # promised, and what the nonlinear model keeps
+    >>> round(estimate.loss), round(there.value(estimate.z)[0])  # loss of the linear model, and of the nonlinear one
     (97, 100)
     """
 
     formulation: Formulation
     model: LinearModel
     structure: Structure
-    _warm: WarmStart  # shared with all programs that `on` makes of this
-    _values: dict[Any, tuple[float, float]] = field(default_factory=dict, init=False)  # loops ask for a point again
+    _warm: WarmStart  # shared with all programs that `on` makes of this one
+    _values: dict[Any, tuple[float, float]] = field(default_factory=dict, init=False)  # of repeated points
 
     def __reduce__(self) -> Any:
-        return pose, (self.formulation, self.model)  # what CVXPY made of the functions does not travel
+        return pose, (self.formulation, self.model)  # CVXPY's canonical forms are not pickled
 
     def _short(self) -> str:
         return f"'{self.formulation.name}' on {self.model._short()}"
@@ -215,7 +215,7 @@ class Program(Brief):
     def value(self, z: Array, weight: float = 1.0) -> tuple[float, float]:
         """Return loss(A z - b) and penalty(z), minimized over the functions' own variables at the weight.
 
-        z is (n,) in units of the scales; the weight matters to variables of the functions' own alone.
+        z is (n,) in units of the scales; the weight only affects the functions' own variables.
         """
         key = z.tobytes(), weight if self.structure.inner else 0.0
         if key not in self._values:
@@ -232,8 +232,8 @@ class Program(Brief):
     def inside(self, z: Array, weight: float) -> Array:
         """Return z (n,), or a nearby point inside the functions' domain.
 
-        An interior point ends at a boundary within its accuracy, and on either side of it: the point is moved a little
-        towards nominal, or away from it where that lies outside.
+        An interior-point solution may lie on either side of a boundary of the domain: it is moved slightly towards
+        nominal, or away from it if nominal is outside.
         """
         for share in (0.0, 1e-9, -1e-9, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3, 1e-1, -1e-1):
             nearer = z - share * z
@@ -278,19 +278,19 @@ class Program(Brief):
             return None
 
     def inliers(self, z: Array) -> Inliers | None:
-        """Return the equations that a robust loss keeps at z (n,); None for a squared loss.
+        """Return the equations that a robust loss does not treat as outliers at z (n,); None for a squared loss.
 
-        InputError for a loss without a slope, or one that rests on few equations (minimax).
+        InputError for a loss without a slope, or one that depends on few equations (minimax).
         """
         if self.loss_form is not None:
             return None
         return inliers_of(self.formulation, self.norms(z), self.model.members[1], self.structure.expressions.loss)
 
     def inlier_model(self, z: Array) -> LinearModel:
-        """Return the equivalent squared-loss model of a robust fit: the rows kept at z (n,), downweighted.
+        """Return the equivalent squared-loss model of a robust fit: the inlier rows at z (n,), downweighted.
 
-        Degrees of freedom, likelihoods and covariances of a robust estimate are those of this model, and it is what
-        every rule for the weight sees. With a squared loss it is that loss's. InputError as for `inliers`.
+        Degrees of freedom, likelihoods and covariances of a robust estimate are those of this model; rules for the
+        weight use it, too. For a squared loss it is the model itself. InputError as for `inliers`.
         """
         inliers = self.inliers(z)
         return self.squared if inliers is None else inliers(self.model, z)[0]
@@ -298,11 +298,11 @@ class Program(Brief):
     # --- solutions -----------------------------------------------------------------------------------------------
 
     def problem(self, weight: float) -> cp.Problem:
-        """Return the program as a CVXPY problem in the variable ``z``: what it minimizes is what `solve` minimizes.
+        """Return the program that `solve` solves as a CVXPY problem in the variable ``z``.
 
-        ``A``, ``b`` and ``weight`` are parameters of those names (`cp.Problem.param_dict`), and so are the parameters
-        of the formulation's own functions; it obeys CVXPY's rules for parametrized programs (DPP). InputError for a
-        weight that is negative or not finite.
+        ``A``, ``b`` and ``weight`` are parameters with these names (`cp.Problem.param_dict`), as are the parameters of
+        the formulation's own functions; it obeys CVXPY's rules for parametrized programs (DPP). InputError for a weight
+        that is negative or not finite.
         """
         A, b = self.rows
         data = (
@@ -325,7 +325,7 @@ class Program(Brief):
         total = substituted(shape.of_r(loss), instead) + self.model.offset
         if penalty is not None:
             price = substituted(penalty, instead)
-            if price.parameters():  # a parameter times a parameter would not be DPP
+            if price.parameters():  # a product of two parameters is not DPP
                 above = cp.Variable(name="penalty")
                 every.append(above >= price)
                 price = above
@@ -346,23 +346,23 @@ class Program(Brief):
     ) -> Estimate:
         """Return the solution at a weight.
 
-        At weight zero there is no penalty, and directions that the data do not identify stay nominal but where
+        At weight zero the penalty is absent, and directions that the data do not identify stay nominal unless
         constraints move them.
 
-        ``damping`` is a term that keeps the solution near a point. With a ``solver`` of CVXPY, its ``settings`` or
-        ``verbose``, `problem` is solved by it, whatever the structure; by Clarabel where loss and constraints share
-        variables of their own.
+        ``damping`` is a term that keeps the solution near a point. If ``solver``, ``settings`` or ``verbose`` is given,
+        CVXPY solves `problem` with that solver (default Clarabel), whatever its structure; without them, if loss and
+        constraints share own variables.
 
-        InputError for a weight that is negative or not finite, and a solver that is not installed. NoSolutionFound
-        when the solver does not end with "optimal", or its point misses the constraints; its ``conflict`` names what
-        contradicts what.
+        InputError for a weight that is negative or not finite, and a solver that is not installed. NoSolutionFound if
+        the solver does not end with "optimal", or its point violates the constraints; ``conflict`` has the
+        contradicting ones.
         """
         weight = self._weight(weight)
         if solver or settings or verbose:
             return self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
         if self.structure.joint:
             return self._by_cvxpy(weight, damping, cp.CLARABEL, TIGHT, False)
-        if weight == 0 and not self.linear_penalty:  # what multiplies zero is no part of the program
+        if weight == 0 and not self.linear_penalty:  # a penalty times zero is no part of the program
             alone = self._part(self.structure.without_penalty, self.model).solve(damping=damping)
             return replace(alone, penalty=self.value(alone.z, 0.0)[1])
         if damping is None and self.closed_form:
@@ -381,7 +381,7 @@ class Program(Brief):
             return triangular_solution(T[:n, :n], T[:n, n])
         z = self.ridge.minima(np.array([weight]))[0]
         if form is not None and weight > 0 and not (form.diagonal and (form.L == 1).all()):
-            # a penalty that hardly holds some directions costs the formula digits
+            # a penalty with little curvature in some directions costs the closed form digits
             z = z + np.linalg.lstsq(rows[:, :n], rows[:, n] - rows[:, :n] @ z, rcond=RANK_TOLERANCE)[0]
         return z
 
@@ -404,8 +404,8 @@ class Program(Brief):
     def tangent(self, z: Array, weight: float) -> Array | None:
         """Return an orthonormal basis (n, k) of the active constraints' null space at z.
 
-        Equations, inequalities and cones, linearized at z; own variables move along. None where no constraint is
-        active, and with own variables that the loss shares, where it is not known.
+        Equality, inequality and cone constraints are linearized at z; own variables are free to follow. None if no
+        constraint is active, or if it is unknown because the loss shares own variables.
         """
         found = self._active(z, weight)
         if found is None:
@@ -434,11 +434,11 @@ class Program(Brief):
         return self._duals(replace(optimum, dual=np.where(active, optimum.dual, 0.0)))
 
     def _active(self, z: Array, weight: float) -> tuple[Point, np.ndarray] | None:
-        """Return the minimum from z on, and which rows of the constraints are active there (m,), cones as a whole.
+        """Return the minimum next to z, and which rows of the constraints are active there (m,), cones as a whole.
 
-        An interior point leaves multipliers and slacks of which neither is zero: a constraint is active if its
-        multiplier is above its slack times the least curvature that the penalty has. None without constraints, with own
-        variables that the loss shares, and where there is no minimum.
+        An interior-point method leaves both multipliers and slacks nonzero: a constraint is active if its multiplier
+        exceeds its slack times the least curvature of the penalty. None without constraints, without minimum, and if
+        the loss shares own variables.
         """
         if not self.formulation.constraints or self.structure.joint:
             return None
@@ -479,7 +479,7 @@ class Program(Brief):
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
         canonical = self.structure.canonical
         z = optimum.x[canonical.at]
-        # half: the projection by which `violation` judges the point is no more exact
+        # half: the projection in `violation` is no more accurate
         if self.structure.constrained and canonical.missed(optimum.x) > 0.5 * FEASIBLE:
             z = self.nearest(z)
         return self._at(z, weight, partial(self._duals, optimum), optimum.iterations)
@@ -487,12 +487,12 @@ class Program(Brief):
     def _unidentified(self) -> Estimate:
         """Return the minimum at weight zero where the data do not identify all, by the proximal point method.
 
-        z <- argmin loss(A z - b) + |F (z - last z)|^2 subject to constraints(z) from z = 0 on, with F'F ever smaller
-        parts of the projection on what is not identified (Rockafellar, SIAM J. Control Optim. 14(5), 1976).
+        z <- argmin loss(A z - b) + |F (z - last z)|^2 subject to constraints(z), from z = 0; F'F is a decreasing
+        multiple of the projection on the unidentified directions (Rockafellar, SIAM J. Control Optim. 14(5), 1976).
         """
         _, s, V = self.model.svd
         best = self._by_structure(0.0, Damping(np.zeros(len(s)), V[s == 0]))
-        for part in PROXIMAL if self.structure.constrained else ():  # else the term is zero there
+        for part in PROXIMAL if self.structure.constrained else ():  # otherwise the term is zero there
             try:
                 found = self._by_structure(0.0, Damping(best.z, part * V[s == 0]))
             except NoSolutionFound:
@@ -512,7 +512,7 @@ class Program(Brief):
             price = np.bincount(_sides(lower, upper), np.abs(found.dual), self.structure.n)
             below = found.x - lower < upper - found.x
             duals = []
-            for box in self.formulation.constraints:  # of those that share a bound the first one has its price
+            for box in self.formulation.constraints:  # boxes that share a bound: the first gets the multiplier
                 low, high = box.bounds(self.structure.parameters) if isinstance(box, Box) else self.box
                 duals.append(np.where(np.where(below, low == lower, high == upper), price, 0.0))
                 price = price - duals[-1]
@@ -549,14 +549,14 @@ class Program(Brief):
         for variable in problem.variables():
             variable.save_value(None)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # an inaccurate answer is judged by what it misses
+            warnings.simplefilter("ignore", UserWarning)  # an inaccurate solution is judged by its violation
             try:
                 problem.solve(solver=solver, verbose=verbose, **settings)
             except TypeError as error:
                 if not settings:
                     raise
                 raise InputError("settings", f"{error}".rstrip("."), f"settings that {solver} knows") from None
-            except (cp.SolverError, ValueError, ArithmeticError, RuntimeError) as error:  # solvers have their own
+            except (cp.SolverError, ValueError, ArithmeticError, RuntimeError) as error:  # each solver has its own
                 raise self._failure(first or f"an error of {solver}: {error}", weight, solver) from None
         if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or z.value is None:
             raise self._failure(first or problem.status, weight, solver)
@@ -571,10 +571,10 @@ class Program(Brief):
 
     def _failure(self, status: str, weight: float, solver: str) -> NoSolutionFound:
         """Return why a solver of CVXPY found no solution."""
-        from rpim_opt.convex.infeasible import advice, conflict  # of programs without a solution
+        from rpim_opt.convex.infeasible import advice, conflict  # for programs without a solution
 
         contradiction = None
-        if self.structure.constrained:  # which may contradict each other, whatever the solver stopped with
+        if self.structure.constrained:  # they may contradict each other, whatever the status
             contradiction = conflict(self.structure)
         elif status.startswith("infeasible"):
             status = "stalled"  # a program without constraints always has a point
@@ -589,7 +589,7 @@ def _squared(model: LinearModel, form: Quadratic) -> LinearModel:
     A, b = form.times(model.A), form.times(model.b) + form.c
     group = model.group
     if form.diagonal:
-        counts = form.L > 0  # an equation without weight is none
+        counts = form.L > 0  # equations without weight are none
         A, b, group = A[counts], b[counts], group[counts]
     else:
         group = np.zeros(len(b), dtype=int)  # its rows mix configurations
@@ -606,8 +606,8 @@ def pose(
 ) -> Program:
     """Return the program of a formulation, or of the ready one of that name, on a linear model A z ~ b.
 
-    The formulation's functions are called now, once; of one that is not ``solvable`` the quadratic ``forms`` of loss
-    and penalty may be known. InputError where they do not return convex expressions and constraints of CVXPY.
+    The formulation's functions are called once, now. If it is not ``solvable``, ``forms`` may state the quadratic forms
+    of loss and penalty. InputError if they do not return convex expressions and constraints of CVXPY.
 
     >>> import numpy as np
     >>> import rpim_opt as ro

@@ -15,9 +15,9 @@ from rpim_opt.convex.expressions import cp
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, svd
 
 DENSE = 2000
-"""Variables up to which a quadratic with products of different variables is factored."""
+"""Largest number of variables of a quadratic with mixed products that is factored."""
 ROUNDING = 1e-12
-"""Eigenvalues and slopes below this part of the largest are what rounding leaves of zero."""
+"""Eigenvalues and slopes below this part of the largest are rounding errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,14 +68,14 @@ def identity(n: int) -> Quadratic:
 def quadratic(expression: Any, variable: cp.Variable) -> Quadratic | None:
     """Return an expression of one variable as a quadratic; None if it is not quadratic.
 
-    In CVXPY's canonical form 1/2 x'P x + q'x with A x + s = b it is one where all of s is zero (no inequality, no
-    cone) and the equations give the variables that CVXPY added.
+    In CVXPY's canonical form 1/2 x'P x + q'x with A x + s = b it is quadratic if all of s is zero (no inequality, no
+    cone) and the equations determine the variables that CVXPY added.
     """
     if {v.id for v in expression.variables()} != {variable.id}:
         return None
     if not expression.is_quadratic() or expression.is_affine() or cp.huber in expression.atoms():
         return None  # affine expressions and huber are quadratic to CVXPY
-    variable.save_value(None)  # atoms ask for the value of what they are made of, and may get a stale one
+    variable.save_value(None)  # atoms read their arguments' values, which may be stale
     data = cp.Problem(cp.Minimize(expression)).get_problem_data(cp.CLARABEL, solver_opts={})[0]
     if data.get("P") is None or data["dims"].zero != len(data["b"]) or data.get("lower_bounds") is not None:
         return None
@@ -101,7 +101,7 @@ def _reduced(data: dict[str, Any], variable: cp.Variable) -> tuple[Any, Array] |
         return H, g
     try:
         factors = scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(A[:, rest]))
-    except RuntimeError:  # singular: they do not follow from v
+    except RuntimeError:  # singular: v does not determine them
         return None
     M = -scipy.sparse.csr_array(factors.solve(A[:, own].toarray()))
     d = factors.solve(np.asarray(data["b"], dtype=float))
@@ -145,15 +145,15 @@ def _completed(H: Any, g: Array, at_zero: float) -> Quadratic | None:
 class Ridge:
     """Minimum of |A z - b|^2 + weight |L z - c|^2 over z, at every weight.
 
-    With y = L z - c as unknowns, and what L does not see (y0) eliminated by projection, A turns into U diag(s) V' and
-    the minimum is (Hansen 1998, Rank-Deficient and Discrete Ill-Posed Problems, sec. 2.3)::
+    With y = L z - c as unknowns, and the directions y0 that L does not see eliminated by projection, A becomes U
+    diag(s) V', and the minimum is (Hansen 1998, Rank-Deficient and Discrete Ill-Posed Problems, sec. 2.3)::
 
         z(weight) = offset + B diag(s / (s^2 + weight)) beta,    beta = U'b
 
-    Directions that neither A nor L see stay where the penalty's centre, or nominal, has them. beta, s (p,), s below
-    `RANK_TOLERANCE` times the largest zero; B (n, p); offset (n,) is z at infinite weight; perp the square that no z
-    explains; free (n, f) the identifiable directions that L leaves free, with covariance free free'; null (n, u) the
-    others.
+    Directions that neither A nor L sees stay at the penalty's centre, or nominal. beta, s (p,), where s below
+    `RANK_TOLERANCE` times the largest is zero; B (n, p); offset (n,) is z at infinite weight; perp the sum of squares
+    that no z explains; free (n, f) spans the identifiable directions without penalty, with covariance free free'; null
+    (n, u) the others.
     """
 
     beta: Array
@@ -238,7 +238,7 @@ def ridge(model: LinearModel, penalty: Quadratic | None) -> Ridge:
         start = T @ (U[:, :rank].T @ form.c)
     b = b - A @ start
     Q, free, null = np.zeros((n, 0)), N, N
-    if N.size:  # what the data see of the directions that L leaves free
+    if N.size:  # identifiable directions that the penalty leaves free
         U, s, Vt = np.linalg.svd(A @ N, full_matrices=True)
         rank = int(np.count_nonzero(s > RANK_TOLERANCE * max(s[0], np.linalg.norm(A, 2))))
         Q, free, null = U[:, :rank], N @ (Vt[:rank].T / s[:rank]), N @ Vt[rank:].T
@@ -247,13 +247,13 @@ def ridge(model: LinearModel, penalty: Quadratic | None) -> Ridge:
         U, s, Vt = svd(A)
         B = Vt.T
         least = RANK_TOLERANCE * np.max(s, initial=0.0)
-    else:  # whose columns may differ by many orders: with the largest first, small s keep digits
+    else:  # columns may differ by many orders: with the largest first, small s keep digits
         A_y = A @ T
         factors: Any = qr(A_y - Q @ (Q.T @ A_y), mode="economic", pivoting=True)
         U, s, Vt = np.linalg.svd(factors[1], full_matrices=False)
         U, Vt = factors[0] @ U, Vt[:, np.argsort(factors[2])]
         B = T @ Vt.T
-        # In z, not in y: where L hardly holds a direction y is long, and s of the others small beside its s.
+        # in z, not in y: a direction with little penalty makes y long, and the other s small relative to its s
         least = RANK_TOLERANCE * np.linalg.norm(A, 2) * np.linalg.norm(B, axis=0)
     rounding = len(s) * float(np.finfo(float).eps) * np.max(s, initial=0.0)
     s = np.where((s > least) & (s > rounding), s, 0.0)

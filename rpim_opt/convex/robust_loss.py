@@ -17,17 +17,17 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.problem.linear import LinearModel
 
 RARE = 0.01
-"""What part of good sets of data have any configuration that counts as an outlier."""
+"""Probability that a set of good data has any configuration beyond the outlier limit."""
 SMALL = 1e-6
-"""Residuals are taken as no smaller, in sigmas: below, a norm has no slope of its own."""
+"""Lower bound on residuals, in sigmas: a norm has no derivative at zero."""
 SHARE, STEP = 0.3, 1e-4
-"""A step is expected to move a residual by this part of what the last one did, and by this part of it at least."""
+"""Expected change of a residual in the next step, as a part of the last change, and its lower bound."""
 CROSSING = 0.3
-"""Where a loss is not smooth at zero: residuals that moved by more than this part of themselves may yet end there."""
+"""For a loss that is not smooth at zero: a residual that changed by a larger relative amount may still become zero."""
 LEAST_CURVATURE = 1e-3
-"""Curvature along a residual, relative to that across it, where the loss has less: a square needs some."""
+"""Least curvature along a residual, relative to that across it: a quadratic model needs some."""
 SEPARATE = 1e-9
-"""How exactly a loss of several residuals is the sum of their losses, relative."""
+"""Relative tolerance for recognizing a loss as the sum of its entries' losses."""
 
 
 def _quantiles(beyond: float, count: np.ndarray) -> Array:
@@ -49,7 +49,7 @@ def limits(noise: float, configurations: int, count: np.ndarray) -> Array:
 def outlying(norms: Array, count: np.ndarray) -> Array:
     """Return the whitened norms (N,) above which rows or configurations are outliers: s sqrt(chi2_k^-1(1 - 0.01 / N)).
 
-    One good set of data in a hundred exceeds them; s is the `noise_level`.
+    s is the `noise_level`. One set of good data in a hundred has any norm above its limit.
     """
     return limits(noise_level(norms, count), len(norms), count)
 
@@ -75,7 +75,7 @@ class Inliers:
 
 def kept_equations(model: LinearModel, keep: np.ndarray, factor: float) -> LinearModel:
     """Return some of a model's equations (m,), multiplied by the root of a factor."""
-    A, b = np.compress(keep, model.A.T, axis=1).T, model.b[keep]  # the columns stand together, as LAPACK asks
+    A, b = np.compress(keep, model.A.T, axis=1).T, model.b[keep]  # column-major, as LAPACK requires
     if factor != 1:
         A *= np.sqrt(factor)
         b *= np.sqrt(factor)
@@ -83,20 +83,20 @@ def kept_equations(model: LinearModel, keep: np.ndarray, factor: float) -> Linea
 
 
 def inliers_of(formulation: Formulation, norms: Array, count: np.ndarray, loss: Term | None = None) -> Inliers:
-    """Return what a robust loss keeps, from whitened norms (N,) of configurations with ``count`` equations.
+    """Return the inliers of a robust loss, from whitened norms (N,) of configurations with ``count`` equations.
 
-    Its factor is the median of loss'(v) / (2 v) over what it keeps, v the norms, or of a loss over equations norm /
-    sqrt(count), each equation's share, so that storage does not matter. ``loss`` is that of one posed program.
-    InputError for a loss without a slope, or that rests on few equations (minimax).
+    Their factor is the median of loss'(v) / (2 v), with v the norms, or norm / sqrt(count) for a loss over equations:
+    each equation's share, whatever the storage. ``loss`` is that of one posed program. InputError for a loss without a
+    slope, or one that depends on few equations (minimax).
     """
     noise = noise_level(norms, count)
     keep = norms <= limits(noise, len(norms), count)
     share = np.sqrt(count[keep]) if formulation.loss_over == "equation" else 1.0
     v = np.maximum(norms[keep] / share, SMALL)
-    if loss is None or loss.variable.size < len(v):  # of blocks, or of n + 1 rows
+    if loss is None or loss.variable.size < len(v):  # for blocks, or n + 1 rows
         loss = term(formulation.loss, len(v), f"formulation '{formulation.name}', loss")
     slope = None
-    if len(loss.expression.variables()) == 1:  # else there are own ones, on whose values the slope depends
+    if len(loss.expression.variables()) == 1:  # own variables, if any, determine the slope
         slope = loss.slope(np.concatenate([v, np.full(loss.variable.size - len(v), SMALL)]))
     found = f"formulation '{formulation.name}'"
     accepted = "a loss with gradients, without own variables, which covariances, predictions and most rules need; "
@@ -117,7 +117,7 @@ def by_place(formulation: Formulation, groups: np.ndarray) -> bool:
     size = len(groups if formulation.loss_over == "equation" else np.unique(groups))
     r = np.linspace(0.5, 1.5, size)
     loss = term(formulation.loss, size, f"formulation '{formulation.name}', loss")
-    if len(loss.expression.variables()) > 1:  # own ones, which have no values here
+    if len(loss.expression.variables()) > 1:  # own variables, which have no values here
         return False
     one, other = loss(r), loss(np.random.default_rng(0).permutation(r))
     return bool(np.isfinite(one) and abs(one - other) > SEPARATE * abs(one))
@@ -130,17 +130,17 @@ def by_place(formulation: Formulation, groups: np.ndarray) -> bool:
 class QuadraticModel:
     """Quadratic model of a loss that is a sum over rows, for blocks of equations: a `Reweigh`.
 
-    With r_i the residual of a configuration (or of an equation) at z, v = |r_i|, u = r_i / v and w = loss'(v) / (2 v),
-    the equations of i are multiplied by M and their right-hand side is moved such that ::
+    With r_i the residual of a configuration (or an equation) at z, v = |r_i|, u = r_i / v and w = loss'(v) / (2 v), the
+    equations of i are multiplied by M and their right-hand side is shifted such that ::
 
         |M (A_i z' - b_i) - shift|^2 + offset    with    M = sqrt(c) u u' + sqrt(w) (1 - u u')
 
-    has the value and the gradient of the loss at z' = z, its curvature across u, and along u a secant of its slopes
-    over the distance of a step: c is w in the first pass (iteratively reweighted least squares; Holland and Welsch
-    1977), which never lies below the loss, and loss''(v) / 2 in the end, with which steps shorten as Newton's do. In
-    between the loss may be above: the outer loop checks that and damps.
+    has the value and the gradient of the loss at z' = z, and its curvature across u. Along u its curvature is a secant
+    of the loss's slopes over the expected step: first c = w, a model nowhere below the loss (iteratively reweighted
+    least squares; Holland and Welsch 1977), at the end c = loss''(v) / 2, with Newton's convergence. In between the
+    loss may exceed the model: the outer loop checks that and damps.
 
-    ``over`` is what the loss gets, ``"equation"`` or ``"configuration"``; ``before`` (n,) where the last pass was.
+    ``over`` is ``"equation"`` or ``"configuration"``, as for the loss; ``before`` (n,) the point of the last iteration.
     """
 
     loss: Callable[[Any], Any]
@@ -163,8 +163,8 @@ class QuadraticModel:
         priced = term(self.loss, len(v), f"formulation '{self.name}', loss")
         slope = self.slope(priced, v)
         across = slope / (2 * v)
-        # half the curvature along residuals, by the slopes here and where a step may lead: at first where the slope,
-        # which is odd, is the negative one, as such squares lie nowhere below the loss
+        # half the curvature along residuals, from slopes here and at the expected step; at first from those at +-v,
+        # since such squares lie nowhere below the loss
         change = 2 * v
         if self.before is not None:
             moved = np.sqrt(np.bincount(which, (model.A @ (z - self.before)) ** 2))
@@ -196,7 +196,7 @@ def separable(loss: Callable[[Any], Any], over: str = "configuration") -> bool:
     v = np.geomspace(1e-3, 1e3, 7)
     try:
         several, one = term(loss, len(v), "loss"), term(loss, 1, "loss")
-    except (ValueError, InputError):  # one that is made for a certain number of residuals
+    except (ValueError, InputError):  # a loss for a fixed number of residuals
         return False
     whole = several(v)
     alone = sum(one(np.array([each])) for each in v)

@@ -37,8 +37,8 @@ __all__ = [
 def compare(program: Program) -> dict[str, Selection]:
     """Return the choice of every selector that applies to a program, by name.
 
-    Those that hold configurations out are left out where that would take long: without a closed form, or with more
-    than 200 configurations.
+    Cross-validation rules are omitted where they would take long: without a closed form, or with more than 200
+    configurations.
 
     >>> import rpim_opt as ro
     >>> program = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).program
@@ -54,7 +54,7 @@ def compare(program: Program) -> dict[str, Selection]:
     for name, rule in SELECTORS.items():
         if not quick and rule in HOLDING_OUT:
             continue
-        with contextlib.suppress(InputError, NoSolutionFound):  # it does not serve this formulation or these data
+        with contextlib.suppress(InputError, NoSolutionFound):  # not applicable to this formulation or these data
             chosen[name] = rule(program)
     return chosen
 
@@ -62,15 +62,15 @@ def compare(program: Program) -> dict[str, Selection]:
 _names = [each.name for each in iter_modules([str(Path(__file__).with_name("rules"))])]
 _rules = [getattr(import_module(f"{__package__}.rules.{name}"), "RULES", ()) for name in reversed(_names)]  # REML first
 SELECTORS: dict[str, Callable[[Program], Selection]] = {rule.__name__: rule for some in _rules for rule in some}
-"""The rules that come with the package, by the names of their functions: ``RULES`` of the modules in ``rules``."""
+"""The rules of the package by the names of their functions: ``RULES`` of the modules in ``rules``."""
 LEARNED = "learned"
-"""Stands for hyperparameters that are estimated from the data, and no weight."""
+"""Stated in place of a weight: hyperparameters are estimated from the data."""
 
 
 def weight_of(stated: Any) -> Any:
     """Return a weight, or a selector by its name; None for "learned".
 
-    InputError for a name that no selector has.
+    InputError for an unknown name.
     """
     if not isinstance(stated, str):
         return stated

@@ -1,13 +1,13 @@
 """Expressions of a formulation for data of one shape, and the structure that selects the solver.
 
-A user's functions are called whenever a program is posed (`pose`), never by `Program.on`. Besides these a loss is
-called by `expressions.term` where its values or slopes are needed at numbers: for blocks of rows, and for what a
-robust loss keeps.
+A user's functions are called when a program is posed (`pose`), never by `Program.on`; a loss is also called by
+`expressions.term` where its values or slopes are needed at numbers: for blocks of rows, and for the inliers of a robust
+loss.
 
-CVXPY canonicalizes penalty and constraints once for a `Structure` (`canonical`), a loss once where Clarabel takes all
-of its rows (`Loss.canonical`), and some entries of a nonsmooth loss anew for every working set (`Loss.some`); besides,
-a quadratic of a user's is recognized by a canonical form, and the last resort (`Program.solve`) is canonicalized anew.
-Structures, warm starts and Clarabel's solvers live as long as the programs that `Program.on` makes of one another.
+CVXPY canonicalizes penalty and constraints once per `Structure` (`canonical`), a loss once if Clarabel takes all its
+rows (`Loss.canonical`), and entries of a non-smooth loss for every working set (`Loss.some`). A user's quadratic is
+also recognized by its canonical form, and the last resort (`Program.solve`) canonicalizes again. Structures, warm
+starts and Clarabel's solvers are shared by all programs that `Program.on` derives from one another.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
 
 INVARIANT = (SQUARES, NORM2)
-"""Losses that declare to see only the length of the residual: [A b] may be replaced by its QR factor."""
+"""Losses that depend only on the residual's length: [A b] may be replaced by its QR factor."""
 TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
-"""Clarabel's tolerances for variables of the functions' own."""
+"""Clarabel's tolerances for the functions' own variables."""
 
 
 class Expressions:
     """Expressions that a formulation's functions return, with private copies of the user's parameters and variables.
 
-    ``loss`` and ``penalty`` are of what they get (residuals or norms, z or norms of groups), ``penalty_of_z`` and
-    ``constraints``, one list for every function, of z; ``stated`` are loss, penalty and constraints, ``live`` these
-    with the user's own parameters.
+    ``loss`` and ``penalty`` are expressions of their arguments (residuals or norms, z or norms of groups),
+    ``penalty_of_z`` and ``constraints``, one list per function, of z; ``stated`` are loss, penalty and constraints,
+    ``live`` the same with the user's own parameters.
     """
 
     def __init__(self, formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray):
@@ -101,7 +101,7 @@ class Expressions:
             of = f"{where}, {name_of(constraint, k)}"
             live.append(listed(called(constraint, of, z, known), of))
         composed = {"penalty": self.penalty_of_z} if instead and self.penalty is not None else {}
-        if argument is not r:  # norms are convex and nonnegative, as absolute values are
+        if argument is not r:  # norms are convex and nonnegative, like absolute values
             composed["loss"] = substituted(self.loss.expression, {id(argument): cp.abs(cp.Variable(argument.size))})
         for what, expression in composed.items():
             if not expression.is_convex():
@@ -143,9 +143,9 @@ def declared(formulation: Formulation) -> bool:
 class Structure:
     """A formulation for data of one shape: its functions' expressions of r and z, their structure and their values.
 
-    A formulation that is `declared` is called when an expression of it is first needed: what a formula or an active
-    set solves, it solves without CVXPY. Of one whose functions a file could not hold the ``forms`` of loss and penalty
-    may be known, and all else raises InputError.
+    The functions of a `declared` formulation are called when an expression is first needed: a closed form or an active
+    set needs no CVXPY. Without the functions (read from a file that cannot hold them) the ``forms`` of loss and penalty
+    may be known; anything else raises InputError.
     """
 
     def __init__(
@@ -167,7 +167,7 @@ class Structure:
             self.loss_form, self.penalty_form = forms or (None, None)
         elif self._declared:
             self.box  # noqa: B018 - limits that do not fit the parameters are refused now
-        else:  # a user's functions may return another thing later
+        else:  # a user's functions may return something else later
             self.expressions  # noqa: B018
 
     @property
@@ -259,7 +259,7 @@ class Structure:
     def box(self) -> tuple[Array, Array] | None:
         """Lower and upper bounds (n,) where every constraint is a `Box`, infinite where there is none.
 
-        None beside another constraint, and where they contradict each other.
+        None if there is another constraint, or if they contradict each other.
         """
         boxes = [constraint for constraint in self.formulation.constraints if isinstance(constraint, Box)]
         if len(boxes) < len(self.formulation.constraints):
@@ -316,10 +316,10 @@ class Structure:
                 parameter.value = number
             if not minimized(problem, **TIGHT):
                 return float("inf"), 0.0
-            for variable, number in ((a.z, z), (a.loss.variable, v)):  # not what the solver leaves of them
+            for variable, number in ((a.z, z), (a.loss.variable, v)):  # not the values left by the solver
                 variable.save_value(number)
             penalty: Any = 0.0 if a.penalty_of_z is None else a.penalty_of_z.value
-            return np.asarray(a.loss.expression.value).item(), np.asarray(penalty).item()  # of a perspective it is (1,)
+            return np.asarray(a.loss.expression.value).item(), np.asarray(penalty).item()  # (1,) for a perspective
 
     @cached_property
     def _over_own(self) -> tuple[cp.Problem, list[cp.Parameter]]:
@@ -336,7 +336,7 @@ class Structure:
 
     def loss_of(self, r: Array) -> float:
         """Return the loss of a residual (m,)."""
-        if self.formulation.loss == SQUARES:  # of residuals or of norms
+        if self.formulation.loss == SQUARES:  # of residuals or norms
             return float(r @ r)
         return self.expressions.loss(self.argument(r))
 
@@ -383,7 +383,7 @@ def structure(
 def in_blocks(formulation: Formulation) -> tuple[Formulation, QuadraticModel | None]:
     """Return the formulation for blocks of rows, and the quadratic model of its loss; None if it needs none.
 
-    A loss that sees only the length of the residual needs nothing. InputError for one that is no sum over rows.
+    None if the loss depends only on the residual's length. InputError for a loss that is no sum over rows.
     """
     if formulation.loss in INVARIANT:
         return replace(formulation, loss_over="equation"), None

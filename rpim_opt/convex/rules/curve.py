@@ -11,11 +11,11 @@ from rpim_opt.convex.program import Estimate, Program
 from rpim_opt.convex.rules.selection import Selection, choice, least_between, on_inliers, skipped, solved, weight_grid
 
 SLOWEST = 1e-200
-"""Squared speed below which a curve stands still."""
+"""Squared speed below which a curve is stationary."""
 SHARP = 0.5
-"""Part of the largest curvature from which a path with kinks has another corner."""
+"""Part of the largest curvature that makes another corner of a path with a non-smooth penalty."""
 GRID = 60
-"""Weights among which a corner is sought where each takes solving."""
+"""Number of weights searched for a corner if each has to be solved."""
 GOLDEN = (1 + 5**0.5) / 2
 
 
@@ -24,10 +24,10 @@ def l_curve(program: Program) -> Selection:
     """Choose the corner of the L-curve: the largest curvature of (ln |A z - b|, ln |z|).
 
     With a closed form the derivatives are analytic (Hansen 1998, Rank-Deficient and Discrete Ill-Posed
-    Problems, sec. 4.6; sign such that the corner of an L is positive) and the maximum is refined between
-    the neighbours on the grid. Otherwise the curvature is that of the circle through three neighbouring
-    points (Cultrera and Callegaro 2020). A maximum at the edge is no corner, and
-    neither is a curve bent the other way everywhere; the weight is then that edge, or the lower one.
+    Problems, sec. 4.6; sign such that the corner of an L is positive), and the maximum is refined between its
+    neighbours on the grid. Otherwise the curvature is that of the circle through three neighbouring points (Cultrera
+    and Callegaro 2020). A maximum at an edge is no corner, and a curve with negative curvature everywhere has none: the
+    weight is then that edge, or the lower one.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
@@ -45,7 +45,7 @@ def l_curve(program: Program) -> Selection:
         failed = skipped(int(np.count_nonzero(~finite)))
         weights, score = every[finite], menger(points[finite])
     best = int(np.argmax(score))
-    if not program.linear_penalty:  # where the last parameters vanish, a path bends like at a corner, far above noise
+    if not program.linear_penalty:  # where the last parameters vanish, the path has a spurious corner far above noise
         peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])) + 1
         sharp = peaks[score[peaks] >= SHARP * np.max(score)]
         best = int(sharp[0]) if len(sharp) else best
@@ -58,7 +58,7 @@ def l_curve(program: Program) -> Selection:
     chosen = choice("l_curve", weights, score, best, "corner of the L-curve" + failed, no_corner + failed)
     if chosen.interior and program.closed_form:
         refined, opposite = least_between(lambda tried: -_curvature(program, tried), weights, best)
-        if -opposite > score[best]:  # the search sees one maximum of several
+        if -opposite > score[best]:  # the search finds one of several maxima
             chosen = replace(chosen, weight=refined)
     return chosen
 
@@ -79,7 +79,7 @@ def _curvature(program: Program, weights: Array) -> Array:
     z2 = s2 * beta2 / (s2 + w) ** 2
     eta = z2.sum(1)
     rho = (w**2 * beta2 / (s2 + w) ** 2).sum(1) + perp
-    # derivatives by t, once and twice
+    # first and second derivatives by t
     first = (z2 / (s2 + w)).sum(1)
     second = (z2 / (s2 + w) ** 2).sum(1)
     eta1 = -2 * weights * first
@@ -93,7 +93,7 @@ def _curvature(program: Program, weights: Array) -> Array:
     u2 = rho2 / rho / 2 - 2 * u1**2
     v2 = eta2 / eta / 2 - 2 * v1**2
     speed = u1**2 + v1**2
-    # a curve that stands still, of data that the nominal robot fits exactly, has none
+    # without a corner: a stationary curve, of data that the nominal robot fits exactly
     return np.divide(u1 * v2 - v1 * u2, speed**1.5, out=np.zeros_like(speed), where=speed > SLOWEST)
 
 
@@ -105,7 +105,7 @@ def menger(points: Array) -> Array:
     cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
     sides = [np.linalg.norm(side, axis=1) for side in (before, after, points[2:] - points[:-2])]
     product = np.prod(sides, axis=0)
-    # points that coincide have no circle; neither have those that differ by rounding
+    # coincident points have no circle, nor have those that differ by rounding
     inner = np.divide(2 * cross, product, out=np.zeros(len(cross)), where=product > 1e-18)
     return np.concatenate([[0.0], inner, [0.0]])
 
@@ -115,9 +115,9 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
     """Search the corner of the L-curve without a grid: golden sections by Menger curvature, any formulation.
 
     Cultrera and Callegaro 2020 (IOP SciNotes 1:025004): of four points on the curve the inner one with the larger
-    curvature stays, and the interval shrinks to its neighbours; one new solution a step.
+    curvature is kept, and the interval shrinks to its neighbours; each step needs one new solution.
 
-    It ends at a length ``tolerance`` of the interval of ln weight. InputError for a formulation without penalty.
+    It ends at a width ``tolerance`` of the interval of ln weight. InputError for a formulation without penalty.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.group_lasso, weight=ro.corner)
@@ -140,7 +140,7 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
     best = left
     while end - begin > tolerance:
         on_the_right = curvature(left, right, end)
-        # a curve bent the other way is the flat end of the L, which has no corner: it is cut off
+        # negative curvature is the flat end of the L, without a corner: it is cut off
         if on_the_right < 0 or curvature(begin, left, right) > on_the_right:
             best, end, right = left, right, left
             left = (end + GOLDEN * begin) / (1 + GOLDEN)
@@ -149,7 +149,7 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
             right = begin + end - left
     order = [t for t in sorted(seen) if np.isfinite(seen[t]).all()]
     if not order:
-        program.solve(float(np.exp(best)))  # raises what the solver says
+        program.solve(float(np.exp(best)))  # raises the solver's error
     points = np.array([seen[t] for t in order])
     interior = bool(low + 0.1 < best < high - 0.1)
     note = "corner of the L-curve by golden-section search"

@@ -23,14 +23,14 @@ from rpim_opt.convex.rules.selection import (
 )
 
 PARTS = 100
-"""Configurations up to which each is left out alone, where each takes solving; of more, so many parts are left out."""
+"""Number of parts that are held out in turn if each has to be solved: configurations, or parts of more of them."""
 COARSE, FOLDS = 12, 10
-"""Weights with which a search for the least error begins, where each takes solving, and the parts that tell where."""
+"""Initial weights of a search for the least error if each has to be solved, and the folds that locate it."""
 ASIDE = 1e-3
-"""Residual of what is held out from a loss that is no sum over rows, in units of the noise: a constant. At zero, where
-norms and the loss's own variables bend all at once, an interior point stalls."""
+"""Constant residual of held-out rows, in units of the noise, for a loss that is no sum over rows. At zero, where norms
+and the loss's own variables are all non-smooth at once, an interior-point method stalls."""
 DROPPED = 1e-13
-"""Added to what a configuration leaves to itself: below, nothing else decides it."""
+"""Added to 1 - H_gg of a configuration: below, nothing else determines it."""
 
 
 @on_inliers
@@ -38,8 +38,8 @@ def leave_one_out(program: Program) -> Selection:
     """Choose by leave-one-out cross-validation of whole configurations.
 
     For a linear estimator in closed form, r_g^- = (1 - H_gg)^-1 r_g with H = A (A'A + w)^-1 A' (Allen 1974; by blocks).
-    With constraints, another penalty or loss the program is solved without each; of more than 100 configurations
-    without each of 100 parts. InputError for a single configuration, or without penalty.
+    With constraints, another penalty or another loss the program is solved without each configuration, or without each
+    of 100 parts if there are more. InputError for a single configuration, or without penalty.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.leave_one_out)
@@ -48,7 +48,7 @@ def leave_one_out(program: Program) -> Selection:
     """
     with_rows(program, "leave_one_out")
     form = program.loss_form
-    mixed = form is not None and not form.diagonal  # a square then belongs to no configuration
+    mixed = form is not None and not form.diagonal  # squares are then not those of single configurations
     if program.closed_form and not mixed:
         return linear_rule(program, "leave_one_out", _of_squares(program), "smallest leave-one-out error")
     begin = held_out_error(program, _drawn(program, FOLDS))
@@ -59,9 +59,9 @@ def leave_one_out(program: Program) -> Selection:
 def k_fold(program: Program, folds: int = FOLDS, seed: int = 0, parts: Sequence[np.ndarray] | None = None) -> Selection:
     """Choose by cross-validation in folds that keep configurations whole (Stone 1974); any formulation.
 
-    ``folds`` parts are drawn with ``seed``; or ``parts`` are the numbers (k,) of the configurations that are left out
-    together, each in one part: `Dataset.by_session` has those of every session. InputError for fewer configurations
-    than folds, parts that are no division of them, or a formulation without penalty.
+    ``folds`` parts are drawn with ``seed``; or ``parts`` has the numbers (k,) of the configurations held out together,
+    each in exactly one part: `Dataset.by_session` returns those of every session. InputError for fewer configurations
+    than folds, parts that do not partition them, or a formulation without penalty.
 
     >>> from functools import partial
     >>> import rpim_opt as ro
@@ -87,10 +87,10 @@ def two_step(program: Program) -> Selection:
     """Choose by the paper's two steps: a coarse L-curve, then held-out error (section III B and Figs. 7 to 10).
 
     1. From the corner down, 30 weights over ten decades. The residual norm falls with the weight, so its
-       minimum is always the smallest weight; what the paper reads off its Fig. 7 is where the fall ends:
-       the first weight from which one more step lowers the residual norm by less than 1 %.
+             minimum is always the smallest weight; what the paper reads off its Fig. 7 is where the decrease ends:
+             the first weight from which one more step lowers the residual norm by less than 1 %.
     2. Ten weights within the same order of magnitude, 0.184 to 1.653 times that (the paper's 0.563e-14 to
-       5.063e-14 around 3.063e-14), compared by held-out error: every configuration is left out once.
+             5.063e-14 around 3.063e-14), compared by held-out error, with every configuration held out once.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.two_step)
@@ -133,20 +133,20 @@ def _least(program: Program, name: str, note: str, error: Score, begin: Score | 
 def _drawn(program: Program, count: int, seed: int = 0) -> list[np.ndarray]:
     """Return the configurations in so many parts at most, at random."""
     groups, place = np.unique(program.model.group, return_index=True)
-    groups = groups[np.argsort(place)]  # by their rows: numbers depend on where the rows stand
+    groups = groups[np.argsort(place)]  # in order of their rows: sums depend on the order
     return np.array_split(np.random.default_rng(seed).permutation(groups), min(count, len(groups)))
 
 
 def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) -> Score:
     """Return a function for the RMS (K,) of whitened residuals of held-out parts, predicted by solving without them.
 
-    A loss that is no square judges the median of their norms: an outlier held out is no error of the prediction.
+    For a loss other than squares the median of their norms is judged: a held-out outlier is no error of the prediction.
     """
     model = program.model
     groups = np.unique(model.group)
     if len(groups) < 2:
         raise InputError("data", "one configuration", "two or more to hold one out")
-    if parts is None:  # each alone, of too many so many parts
+    if parts is None:  # one per configuration, or fewer
         parts = list(groups[:, None]) if len(groups) <= PARTS else _drawn(program, PARTS)
     part_of = np.full(int(groups.max()) + 1, -1)
     for k, part in enumerate(parts):
@@ -171,7 +171,7 @@ def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) 
             sums = np.zeros((which.max() + 1, len(weights)))
             np.add.at(sums, which, squares.T)
             left.append(sums)
-        norms2 = np.vstack(left)  # of the left-out configurations, at every weight
+        norms2 = np.vstack(left)  # of the held-out configurations, at every weight
         if program.loss_form is None:
             return np.median(np.sqrt(norms2), axis=0)
         return np.sqrt(np.sum(norms2, axis=0) / len(model.b))
@@ -180,13 +180,13 @@ def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) 
 
 
 def _of_squares(program: Program) -> Score:
-    """Return the sums of squares (K,) of all left-out residuals of an estimator with influence Q diag(f) Q', by weight.
+    """Return the sums of squares (K,) of all held-out residuals of an estimator with influence Q diag(f) Q', by weight.
 
-    With f = s^2 / (s^2 + weight) and residuals r of all, r_g^- = (1 - Q_g diag(f) Q_g')^-1 r_g.
+    With f = s^2 / (s^2 + weight) and the residuals r of the full fit, r_g^- = (1 - Q_g diag(f) Q_g')^-1 r_g.
     """
     form, model = program.ridge, program.squared
     s = form.s[form.identifiable]
-    # directions that the penalty leaves free stand beside the others with infinite s^2
+    # directions without penalty are appended with infinite s^2
     s2 = np.concatenate([s**2, np.full(form.unpenalized, 1e300)])
     Q = model.A @ np.hstack([form.B[:, form.identifiable] / s, form.free])
     target = model.b - model.A @ form.offset
@@ -209,4 +209,4 @@ def _of_squares(program: Program) -> Score:
 
 
 RULES = (two_step, leave_one_out, k_fold)
-"""All solve without parts of the configurations, which takes long where there is no closed form."""
+"""These rules solve without parts of the configurations, which is slow without a closed form."""

@@ -20,13 +20,13 @@ def require_linear(program: Program, name: str) -> None:
         accepted = "a quadratic penalty, so that solutions are linear in the data; l_curve, corner and k_fold take any"
         raise InputError(f"selector {name}", found, accepted)
     if program.loss_form is None:
-        program.inlier_model(np.zeros(program.model.A.shape[1]))  # says why there is no linear estimator
+        program.inlier_model(np.zeros(program.model.A.shape[1]))  # raises the reason
 
 
 def linear_rule(program: Program, name: str, score: Score, note: str, local: bool = False) -> Selection:
     """Minimize a score of the linear estimator over a grid, refined between its points.
 
-    With ``local`` an interior minimum goes before an edge.
+    With ``local`` an interior minimum has precedence over an edge.
     """
     require_linear(program, name)
     weights = grid_of(program.ridge)
@@ -43,20 +43,19 @@ def linear_rule(program: Program, name: str, score: Score, note: str, local: boo
 def reml(program: Program) -> Selection:
     """Choose by restricted maximum likelihood (REML), with the noise level profiled out.
 
-    The penalty is read as a normal prior of variance sigma^2 / weight on the robot's parameters and sigma^2 as
-    unknown, so that stated noise that leaves out backlash or gravity does no harm. Frames (base, reflectors,
-    anchors) are fixed effects: the m equations are projected off their columns, because how far a tripod stands
-    says nothing about a gear. Minimizes, with g_i = w / (s_i^2 + w) (Patterson and Thompson 1971, Biometrika
-    58:545; Wahba 1985, Annals of Statistics 13:1378)::
+    The penalty is read as a normal prior of variance sigma^2 / weight on the robot's parameters, with sigma^2 unknown,
+    so that stated noise need not include backlash or gravity. Frames (base, reflectors, anchors) are fixed effects: the
+    m equations are projected off their columns, since the place of a tripod says nothing about a robot. Minimizes, with
+    g_i = w / (s_i^2 + w) (Patterson and Thompson 1971, Biometrika 58:545; Wahba 1985, Annals of Statistics 13:1378)::
 
         m ln(sum beta_i^2 g_i + |r_perp|^2) - sum ln g_i
 
-    Points on a plane or sphere are met by a robot shrunk to nothing, so that their fit tells no noise level: the
-    weight is 1, stated noise and scales at their word. With few data a second maximum may lie at infinite
-    weight, where everything is noise: it counts only if there is no other, and then the weight is 1 too. A choice
-    at the lower edge means that the data support no penalty. Constraints are left out of the likelihood.
+    A robot shrunk to a point fits points on a plane or sphere exactly, so that they determine no noise level: the
+    weight is then 1: stated noise and scales hold. With few data a second maximum may lie at infinite weight, where
+    everything is noise: it counts only if there is no other, and then the weight is 1, too. A choice at the lower edge
+    means that the data support no penalty. Constraints are left out of the likelihood.
 
-    InputError for another penalty than a quadratic.
+    InputError for a penalty that is not quadratic.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -91,7 +90,7 @@ def reml(program: Program) -> Selection:
 def gcv(program: Program) -> Selection:
     """Choose by generalized cross-validation: minimize rho(w) / (m - dof(w))^2 (Golub, Heath and Wahba 1979).
 
-    rho = |A z - b|^2, dof = sum s_i^2 / (s_i^2 + w). InputError for another penalty than a quadratic.
+    rho = |A z - b|^2, dof = sum s_i^2 / (s_i^2 + w). InputError for a penalty that is not quadratic.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.gcv)
@@ -102,21 +101,21 @@ def gcv(program: Program) -> Selection:
     def score(weights: Array) -> Array:
         rho, freedom = program.ridge.misfits(weights)
         left = program.squared.equations - freedom
-        return np.where(left > 0, rho / np.maximum(left, 1e-300) ** 2, np.inf)  # no weight serves that leaves none
+        return np.where(left > 0, rho / np.maximum(left, 1e-300) ** 2, np.inf)  # useless without degrees of freedom
 
     return linear_rule(program, "gcv", score, "smallest generalized cross-validation error")
 
 
 DISCREPANCY = 1.1
-"""Discrepancy principle: by how much the residual norm may exceed what the stated noise implies."""
+"""Factor by which the residual norm may exceed the one that the stated noise implies."""
 
 
 @on_inliers
 def discrepancy(program: Program) -> Selection:
     """Choose the largest weight whose misfit agrees with the stated noise (Morozov 1966).
 
-    rho(w) <= tau^2 (m - dof(w)), with tau = 1.1: without that room one data set in two would fit at no weight.
-    InputError for another penalty than a quadratic.
+    rho(w) <= tau^2 (m - dof(w)), with tau = 1.1: with tau = 1 one data set in two would fit at no weight. InputError
+    for a penalty that is not quadratic.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.discrepancy)
@@ -143,7 +142,7 @@ def discrepancy(program: Program) -> Selection:
     if k == len(weights) - 1:
         why = "every weight fits better than the stated noise implies: the noise is stated too large"
         return replace(chosen, weight=float(weights[k]), interior=False, note=why)
-    # between the last weight that fits and the next, where the score crosses zero
+    # between the largest weight that fits and the next one, where the score crosses zero
     share = chosen.score[k] / (chosen.score[k] - chosen.score[k + 1])
     weight = float(np.exp(np.log(weights[k]) + share * np.log(weights[k + 1] / weights[k])))
     return replace(chosen, weight=weight, interior=True, note=note)
@@ -153,7 +152,7 @@ def discrepancy(program: Program) -> Selection:
 def quasi_optimality(program: Program) -> Selection:
     """Choose where the solution changes least with the weight: minimize |w dz/dw| (Tikhonov and Glasko 1965).
 
-    The lowest minimum inside the grid, if there is one. InputError for another penalty than a quadratic.
+    The lowest minimum inside the grid, if there is one. InputError for a penalty that is not quadratic.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.quasi_optimality)

@@ -20,24 +20,24 @@ from rpim_opt.problem.linear import LinearModel
 
 SMALLEST = 1e-100
 LARGEST = 1e100
-"""Weights that are not zero: far beyond those of any problem, and far within the range of doubles."""
+"""Largest weight: far beyond any problem's, and far within the range of doubles."""
 LEAST, MOST = 1e-9, 1e-6
-"""Between which parts of its largest weight a grid of a penalty with kinks begins: below the first, what it adds to the
-objective is less than the accuracy to which that is known."""
+"""Limits of the lower end of a grid for a non-smooth penalty, relative to its largest weight: below the first, the
+penalty is less than the accuracy of the objective."""
 
 HOMOGENEOUS = 1e-9
-"""Relative deviation of penalty(2 z) from 2 penalty(z) that is rounding."""
+"""Relative difference of penalty(2 z) and 2 penalty(z) that is rounding."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Selection(Tabled):
     """A selected weight with its evidence.
 
-    ``name`` is the rule's, of one that comes with the package that of its function: by it a stored result is calibrated
-    again. ``weights`` and ``score`` (K,) are what it tried and compared; ``interior`` says whether the
-    choice lies inside of them, and if not, ``note``, a sentence for the report, what that means.
+    ``name`` is the rule's; for a rule of the package its function's, with which a stored result can be calibrated
+    again. ``weights`` and ``score`` (K,) are those that it compared; ``interior`` states whether the choice lies inside
+    of them, and ``note`` is a sentence for the report, which for a choice at the edge states what that means.
 
-    A selector of one's own is a function of the program that returns a weight, or with its evidence one of these:
+    A user's rule is a function of the program that returns a weight, or a `Selection` with its evidence:
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -98,20 +98,20 @@ def on_inliers(rule: Callable[..., Selection]) -> Callable[..., Selection]:
 
 
 ROUNDS, SETTLED = 4, 0.02
-"""Rounds of a rule over a robust loss, and the change of the weight's logarithm that ends them."""
+"""Largest number of repetitions of a rule for a robust loss, and the change of ln weight that ends them."""
 
 Score = Callable[[Array], Array]
-"""From weights (K,) to what a rule compares, (K,)."""
+"""Function from weights (K,) to the scores (K,) that a rule compares."""
 
 
 SAME_WEIGHT = 1.1
-"""Ratio of weights up to which a search does not tell them apart."""
+"""Ratio of weights that a search need not distinguish."""
 
 EDGES = {
     "lower": "the smallest weight of the grid is best: the data support no penalty",
     "upper": "the largest weight of the grid is best: the data support no deviation",
 }
-"""What it means that a rule chooses an edge of its grid."""
+"""Meaning of a choice at an edge of the grid."""
 
 
 def choice(name: str, weights: Array, score: Array, best: int, note: str, at_edge: str = "") -> Selection:
@@ -128,7 +128,7 @@ def choice(name: str, weights: Array, score: Array, best: int, note: str, at_edg
 def solved(program: Program, weights: Sequence[float] | Array) -> list[Estimate | None]:
     """Return the solutions at weights (K,), None where the solver fails.
 
-    NoSolutionFound where it fails at all of several, and where constraints contradict each other.
+    NoSolutionFound if it fails at every weight, or if constraints contradict each other.
     """
     if program.closed_form:
         return list(program.path(weights))
@@ -170,9 +170,9 @@ def require_weight(weight: float, where: str, file: object = None) -> float:
 def weight_grid(program: Program, count: int = 200) -> Array:
     """Return a geometric grid of weights that covers all changes of the estimate.
 
-    With a squared penalty from 1e-4 s_r^2 to 10 s_1^2, s the singular values of A that are not zero; a nonsmooth
-    penalty (lasso) leaves nothing to identify from its own largest weight on, which ends the grid. Where an interior
-    point solves, the grid begins at eps s_1^2 at least: smaller weights are rounding beside the squares.
+    For a squared penalty it goes from 1e-4 s_r^2 to 10 s_1^2, with s the nonzero singular values of A; for a non-smooth
+    penalty (lasso) it ends at the weight above which nothing is identified. If an interior-point method solves, the
+    grid begins at or above eps s_1^2: smaller weights are rounding relative to the squares.
     """
     if program.formulation.penalty is None:
         raise InputError("weight", "a selector for a formulation without penalty", "weight 0")
@@ -182,7 +182,7 @@ def weight_grid(program: Program, count: int = 200) -> Array:
         return grid_of(program.ridge, count, least)
     weights = grid_of(ridge(program.model, program.penalty_form), count, least)
     n = program.model.A.shape[1]
-    slope = None  # of the loss at nominal
+    slope = None  # of the loss, at nominal
     if program.loss_form is not None and not program.linear_penalty and not program.structure.inner:
         slope = -2 * program.squared.A.T @ program.squared.b
     probe = np.cos(np.arange(1, n + 1))
@@ -209,10 +209,10 @@ def grid_of(form: Ridge, count: int = 200, least: float = 0.0) -> Array:
 def least_between(score: Score, weights: Array, best: int, ratio: float = 1 + 1e-6) -> tuple[float, float]:
     """Return the weight of smallest score between the neighbours of the best grid point, and that score.
 
-    It is known to a ``ratio`` of weights.
+    The weight is accurate to a factor ``ratio``.
     """
     low, high = np.log(weights[[best - 1, best + 1]])
-    with np.errstate(invalid="ignore"):  # of scores where the solver failed
+    with np.errstate(invalid="ignore"):  # scores are NaN where the solver failed
         minimum: Any = minimize_scalar(
             lambda t: score(np.exp([t]))[0], bounds=(low, high), method="bounded", options={"xatol": np.log(ratio)}
         )
@@ -220,10 +220,10 @@ def least_between(score: Score, weights: Array, best: int, ratio: float = 1 + 1e
 
 
 def searched(score: Score, grid: Array, begin: Score | None = None) -> tuple[Array, Array, int]:
-    """Return weights (K,), their scores and the index of the smallest, known to a ratio of `SAME_WEIGHT` either way.
+    """Return weights (K,), their scores and the index of the smallest, known to a factor `SAME_WEIGHT`.
 
-    A coarse grid tells where to search: by the scores, or by cheaper ones, ``begin``; scores that fall towards an end
-    of what was searched are followed.
+    The search starts where the scores on a coarse grid, or cheaper ones, ``begin``, are lowest; if scores fall towards
+    an end of the searched range, it is extended.
     """
     tried: dict[float, float] = {}
 

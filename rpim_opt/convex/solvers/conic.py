@@ -21,12 +21,12 @@ from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.problem.linear import RANK_TOLERANCE
 
 FEASIBLE = 1e-7
-"""By how much a solution may miss its constraints: in scales, relative to its largest component where that is more."""
+"""Largest violation of constraints by a solution, in scales; relative to its largest component if that exceeds 1."""
 SOUGHT, ACCEPTED = 1e-10, 1e-8
-"""Clarabel's tolerances: what it goes on to while it makes progress, and what is good enough."""
+"""Clarabel's tolerances: the one that it aims at while it makes progress, and the one that suffices."""
 SOLVED = ("Solved", "AlmostSolved")
 Attempt = tuple[tuple[str, Any], ...]
-"""Settings of Clarabel by name that are not the usual ones."""
+"""Settings of Clarabel by name that differ from the usual ones."""
 ATTEMPTS: tuple[Attempt, ...] = (
     (),
     (("static_regularization_constant", 1e-10),),
@@ -34,14 +34,14 @@ ATTEMPTS: tuple[Attempt, ...] = (
     (("static_regularization_constant", 1e-7),),
     (("static_regularization_constant", 1e-7), ("equilibrate_enable", True)),  # unknowns of 1e4 prior scales
 )
-"""What is tried in turn: where one factorization stalls, another does not."""
+"""Settings that are tried in turn: one factorization may succeed where another stalls."""
 EQUILIBRATED: Attempt = (
     ("equilibrate_enable", True),
     ("tol_gap_abs", SOUGHT),
     ("tol_gap_rel", SOUGHT),
-    ("tol_feas", 0.1 * SOUGHT),  # relative to the largest residual, an outlier's perhaps
+    ("tol_feas", 0.1 * SOUGHT),  # relative to the largest residual, possibly an outlier's
 )
-"""Settings for the rows of a loss, which come as they are: a quarter fewer iterations."""
+"""Settings for the rows of a loss, which are not scaled before: a quarter fewer iterations."""
 REFINED: Attempt = (
     ("static_regularization_constant", 1e-12),
     ("iterative_refinement_max_iter", 20),
@@ -55,32 +55,32 @@ LOOSE: Attempt = (
     ("equilibrate_enable", True),
     *((f"reduced_tol_{each}", 5e-8) for each in ("gap_abs", "gap_rel", "feas")),
 )
-"""Settings for a distance that may be zero, where progress ends early."""
+"""Settings for a distance that may be zero, where progress stops early."""
 CURVED = 1e-14
 """Eigenvalues of P below this part of the largest are rounding."""
 DENSE = 4e5
-"""Entries of the constraints' matrix up to which active sets are tried."""
+"""Largest number of entries of the constraints' matrix for which active sets are tried."""
 CENTRED = 1e-10
-"""Least weight of |z|^2, relative to the squares, of the point about which Clarabel's unknowns are counted."""
+"""Least weight of |z|^2, relative to the squares, for the point from which Clarabel's unknowns count."""
 FAR, REFINEMENTS = 1e3, 3
-"""Size of a change from which a minimum is refined, and how often that is tried."""
+"""Size of a change from which a minimum is refined, and the largest number of refinements."""
 LARGE = 1e-2
-"""Part of the largest residual from which the objective is scaled down: no scale costs accuracy where it is small, and
-iterations where it is large."""
+"""Part of the largest residual above which the objective is scaled down: without it, small residuals lose accuracy and
+large ones cost iterations."""
 DEAR = 1e6
-"""Costs beside a loss from which they are scaled down."""
+"""Linear costs above this are scaled down if there is a loss."""
 MOST_ACTIVE_SETS = 40
-"""Active sets that are tried before Clarabel is asked for one."""
+"""Number of active sets tried before Clarabel is asked for one."""
 
 
 class Canonical:
     """minimize 1/2 x'P x + q'x + offset subject to b - A x in K, where ``x[at]`` is the variable of the functions.
 
-    Rows of a cone and columns that CVXPY added are scaled to unit size: a solver's tolerances are absolute, and
+    Rows of a cone and columns added by CVXPY are scaled to unit size: a solver's tolerances are absolute, while
     constraints may be stated in metres.
     """
 
-    own = False  # whether the functions have variables of their own
+    own = False  # whether the functions have own variables
 
     def __init__(self, objective: Any, constraints: Sequence[Any], variable: Any):
         from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
@@ -89,7 +89,7 @@ class Canonical:
         every = [objective, *constraints]
         present = {v.id: v for e in every for v in e.variables()}
         self.own = len(present) - (variable.id in present) > 0
-        for v in present.values():  # atoms ask for the value of what they are made of, and may get a stale one
+        for v in present.values():  # atoms read their arguments' values, which may be stale
             v.save_value(None)
         anchor = [] if variable.id in present else [variable == cp.Variable(variable.shape)]
         problem = cp.Problem(cp.Minimize(objective), [*constraints, *anchor])
@@ -108,7 +108,7 @@ class Canonical:
         self.second_order = len(dims.soc)
         self.cone_sizes = sizes + ([3] * (rest // 3) if rest % 3 == 0 else [rest])  # exponential and power cones
         self.row_scale, self.column_scale = _scales(A, len(data["b"]), self.size, self.at, self.linear, self.cone_sizes)
-        free = np.isposinf(data["b"])  # a bound that is none
+        free = np.isposinf(data["b"])  # infinite bounds
         self.row_scale[free] = 0.0
         self.b = np.where(free, 0.0, data["b"]) * self.row_scale + free
         self.q = data["c"] * self.column_scale
@@ -180,9 +180,9 @@ class Canonical:
         return float(0.5 * x @ (self.P @ x) + self.q @ x) + self.offset
 
     def changes(self, near: Array, M: Array, size: float) -> Canonical:
-        """Return the form of changes y of a point (N,), x[at] = near[at] + size M y[at], M (n, n), others size y.
+        """Return the form of changes y of a point (N,): x[at] = near[at] + size M y[at] with M (n, n).
 
-        Its rows are divided by ``size``.
+        The other entries change by size y, and the rows are divided by ``size``.
         """
         from scipy import sparse
 
@@ -236,9 +236,9 @@ def _settings(attempt: Attempt) -> Any:
     settings = import_module("clarabel").DefaultSettings()  # a compiled module, without types
     settings.verbose, settings.max_threads = False, 1
     settings.presolve_enable = False
-    settings.chordal_decomposition_merge_method = "parent_child"  # the default takes longer than to solve
-    settings.equilibrate_enable = False  # rows and columns are scaled already: a quarter fewer iterations
-    if attempt in ((), EQUILIBRATED):  # up to ten take half of the time; a point is judged by its true residuals
+    settings.chordal_decomposition_merge_method = "parent_child"  # the default takes longer than solving
+    settings.equilibrate_enable = False  # rows and columns are scaled before: a quarter fewer iterations
+    if attempt in ((), EQUILIBRATED):  # fewer than ten take twice as long; solutions are judged by their true residuals
         settings.iterative_refinement_max_iter = 1
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = ACCEPTED if attempt else SOUGHT
     settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = ACCEPTED
@@ -263,7 +263,7 @@ class Clarabel:
     def solve(self, P: Any, q: Array, A: Any, b: Array) -> Any:
         """Return the solution of minimize 1/2 x'P x + q'x subject to b - A x in cones; Unsolved where none is found.
 
-        P (its upper triangle) and A are `csc_matrix` with entries at the same places every time.
+        P (its upper triangle) and A are `csc_matrix` with the same sparsity pattern in every call.
         """
         solver = self._solver if self._first == self.attempts[0] else None
         solution = SimpleNamespace(status="")
@@ -271,7 +271,7 @@ class Clarabel:
         for k, attempt in enumerate(self.attempts):
             if k == 0 and solver is not None:
                 changed = {key: v for key, v in numbers.items() if not np.array_equal(v, self._numbers[key])}
-                if changed:  # Clarabel panics at none
+                if changed:  # Clarabel panics at an empty update
                     solver.update(**changed)
             else:
                 solver = self._made(P, q, A, b, attempt)
@@ -348,8 +348,8 @@ class Point:
 class ReducedProgram:
     """minimize |R z - y|^2 + g'z + loss(A z - b) + weight * penalty(z) subject to constraints(z).
 
-    R has ``rows`` rows; ``loss`` is the form of rows that are taken as they are; ``counts`` (N,) are the numbers of
-    equations of the norms that it gets.
+    R has ``rows`` rows; ``loss`` is the canonical form for rows without a quadratic model, ``counts`` (N,) the numbers
+    of equations of the configurations whose norms it gets.
     """
 
     def __init__(
@@ -376,9 +376,9 @@ class ReducedProgram:
     # --- active set --------------------------------------------------------------------------------------------------
 
     def _by_active_set(self, squares: ReducedSquares, weight: float, working: np.ndarray, near: Array) -> Point | None:
-        """Return the minimum by a primal-dual active set; None where some set has none, or too many are tried.
+        """Return the minimum by a primal-dual active set; None if a set has no minimum, or too many are tried.
 
-        All rows that are wrong change at once; where sets recur, the first of them alone, which never cycles where the
+        All rows with a wrong sign change at once; when a set recurs, only the first of them, which cannot cycle if the
         multipliers are unique (Murty, Opsearch 11, 1974).
         """
         p = self.canonical
@@ -419,8 +419,8 @@ class ReducedProgram:
     def _by_cones(self, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None) -> Point:
         """Return Clarabel's minimum.
 
-        Its tolerances are relative to the size of the unknowns: those are changes of a near point, the last one or that
-        of the squares with some weight on |z|^2. A minimum that is far from there, or misses constraints, is refined.
+        Its tolerances are relative to the unknowns, changes from the last point or from the minimum of the squares with
+        a small weight on |z|^2. A minimum that is far from there, or violates constraints, is refined.
         """
         p, n = self.canonical, len(self.canonical.at)
         near = np.zeros(p.size)
@@ -453,10 +453,10 @@ class ReducedProgram:
         return None
 
     def _refined(self, near: Array, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None) -> Point:
-        """Return the minimum next to one (N,), in changes of unit size: z = z0 + V min(1 / s, far) y, others far y.
+        """Return the minimum near ``near`` (N,), in changes of unit size: z = z0 + V min(1 / s, far) y, others far y.
 
-        s and V are the singular values and directions of all equations, far is the size of the point. With small
-        weights some directions of z are 10^5 scales long and others 10^-4, and costs are below a solver's tolerances.
+        s and V are singular values and right singular vectors of all equations, far is the size of the point. With
+        small weights z has components of 10^5 scales and of 10^-4, and costs are below a solver's tolerances.
         """
         p = self.canonical
         z0, every, far = near[p.at], squares.R, np.abs(near).max()
@@ -487,7 +487,7 @@ class ReducedProgram:
             bounds.append(data.linked(A @ z0 - b))
             dense.append(-A.ravel())
         cost = np.concatenate(q)
-        # tolerances are absolute below one; a loss, which is no smaller, takes fewer iterations as it is
+        # tolerances are absolute below one; a loss, which is not smaller, takes fewer iterations unscaled
         largest = max(np.abs(cost).max(), 1e-3 * weight, LARGE * np.abs(residual).max(initial=0.0))
         scale = 1.0 / max(1.0, largest if self.loss is None else largest / DEAR)
         P, matrix = data.filled(weight, np.concatenate(dense))
@@ -500,10 +500,10 @@ class ReducedProgram:
 
 
 class _ConicData:
-    """Clarabel's data of a small program. Unknowns are those of the penalty, R z - y, and those of the loss.
+    """Clarabel's data of a small program; the unknowns are those of the penalty, s = R z - y, and those of the loss.
 
-    Rows: R z - s = y, those of the penalty and of the loss, what the loss gets: v = A z - b, or for norms
-    (v_k, A_k z - b_k) in a second-order cone each.
+    Rows: R z - s = y, those of the penalty, those of the loss, and the loss's argument: v = A z - b, or for norms one
+    second-order cone each, (v_k, A_k z - b_k).
     """
 
     def __init__(self, p: Canonical, k: int, loss: Canonical | None, counts: np.ndarray | None):
@@ -511,7 +511,7 @@ class _ConicData:
         cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.clarabel_cones]
         top, size = k + len(p.b), p.size + k
         squares = np.arange(k)
-        # entries as (rows, columns, numbers): those that other programs have other numbers of, and the rest
+        # entries (rows, columns, numbers): those whose numbers differ between programs, and the rest
         dense = [_block(squares, p.at), _entries(p.A, k, 0)]
         entries = [(squares, p.size + squares, -np.ones(k))]
         curvature = [_entries(p.P, 0, 0, upper=True), (p.size + squares, p.size + squares, np.full(k, 2.0))]
@@ -540,7 +540,7 @@ class _ConicData:
         self.P, place = _assembled(curvature, (size, size))
         self._curvature = self.P.data.copy()
         self.own, self._weighted = dense[1][2], place[: len(curvature[0][0])]
-        # a loss's rows come as the user scaled them
+        # the user scales a loss
         self.clarabel = Clarabel(cones, ATTEMPTS if loss is None else (EQUILIBRATED, *ATTEMPTS))
 
     def linked(self, r: Array) -> Array:
@@ -600,7 +600,7 @@ def nearest(p: Canonical, z: Array) -> Array:
     A = sparse.csc_matrix(
         sparse.vstack([sparse.hstack([sparse.coo_array(p.A), sparse.coo_array((len(p.b), 1))]), link])
     )
-    bound = np.concatenate([p.b, [0.0], -z])  # (t, x - z) in a second-order cone, the least t
+    bound = np.concatenate([p.b, [0.0], -z])  # (t, x - z) in a second-order cone; minimize t
     cone = import_module("clarabel").SecondOrderConeT(n + 1)
     flat = sparse.csc_matrix((N + 1, N + 1))
     clarabel = Clarabel([*p.clarabel_cones, cone], (*ATTEMPTS, LOOSE))
@@ -619,9 +619,9 @@ def triangular_solution(T: Array, b: Array, transposed: bool = False) -> Array:
 def on_working_set(
     squares: ReducedSquares, weight: float, p: Canonical, active: np.ndarray, near: Array
 ) -> tuple[Array, Array] | None:
-    """Return the minimum (N,) next to ``near`` where some rows are equations A x = b, and their multipliers, or None.
+    """Return the minimum (N,) near ``near`` with the active rows as equations A x = b, and their multipliers, or None.
 
-    By the null space of the active rows and corrected seminormal equations.
+    The method is the null space of the active rows, with corrected seminormal equations.
     """
     A, b = p.dense[0][active], p.b[active]
     P, root = p.dense[1], p.root
@@ -649,7 +649,7 @@ def on_working_set(
         if len(L) == Z.shape[1] and pivots.min() > RANK_TOLERANCE * pivots.max():
             for _ in range(3):
                 x = x - Z @ triangular_solution(L, triangular_solution(L, Z.T @ gradient(x), transposed=True))
-        else:  # some directions have no curvature: the minimum next to x, unless there is a slope along them
+        else:  # directions without curvature: the minimum closest to x, unless there is a slope along them
             largest = np.abs(squares.R).max()
             _, values, V = np.linalg.svd(reduced, full_matrices=False)
             curved = values > RANK_TOLERANCE * max(values.max(initial=0.0), 1e-3 * largest)

@@ -1,9 +1,9 @@
 """Proximal Newton for a separable convex loss: a sequence of weighted least-squares models.
 
-Around a point the loss has a quadratic model; its minimum with the penalty and the constraints is a small program, and
-a line search on the true loss ends the step. A non-smooth loss is smoothed by convolution with a box, or by
-sqrt(v^2 + h^2) of norms, with a falling width h; then the rows near a non-smooth point are taken as they are (Lee, Sun
-and Saunders 2014, SIAM J. Optim. 24:1420).
+Around a point the loss has a quadratic model; minimizing it with the penalty and the constraints is a small program,
+and a line search on the true loss completes the step. A non-smooth loss is smoothed by convolution with a box, or by
+sqrt(v^2 + h^2) for norms, with decreasing width h; finally the rows near a non-smooth point are treated exactly (Lee,
+Sun and Saunders 2014, SIAM J. Optim. 24:1420).
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from rpim_opt.convex.expressions import Atom, Evaluation, cp, evaluation, has, i
 from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, ReducedProgram, ReducedSquares, Unsolved
 
 DECREASE = 1e-12
-"""Newton ends where its model promises less, relative to the objective."""
+"""Newton ends when its model predicts a smaller decrease, relative to the objective."""
 INTERIOR = 1e-10
-"""The same where an interior point solves the small program, which is no more exact."""
+"""The same if an interior-point method solves the small program, which is no more accurate."""
 INEXACT = 1e-7
-"""A small program is badly solved where its minimum is above the present point, by more than this part of the loss."""
+"""Relative to the loss: a small program whose minimum is above the current point by more than this was not solved."""
 STEPS = 60
-"""Newton steps of one smoothing width."""
+"""Most Newton steps per smoothing width."""
 FEW_ENTRIES = 400
-"""Entries of a loss up to which Clarabel takes them all as they are, where that is quicker."""
+"""Largest number of entries of a loss that Clarabel treats exactly at once, where that is faster."""
 NEAR = 6
-"""Times the number of parameters: rows near a non-smooth point that are taken as they are."""
+"""Number of rows near a non-smooth point that are treated exactly, per parameter."""
 SMOOTHED = 0.02
-"""Part of what smoothing may add to the loss below which Newton stops at a width."""
+"""Newton stops at a width when the predicted decrease is this part of the largest smoothing error."""
 NARROWER = 10.0
-"""Factor between two widths."""
+"""Ratio of consecutive widths."""
 NARROWEST = 1e-9
 """Smallest width, relative to the mean residual."""
 PROXIMAL = 1e-13
@@ -41,24 +41,24 @@ PROXIMAL = 1e-13
 VANISHED = 1e-12
 """Singular values of A below this part of the largest are rounding."""
 TINY = 1e-12
-"""Norms are taken as no smaller."""
+"""Lower bound on norms."""
 POOR = 1e-3
-"""Ratio of pivots of a Hessian below which it gets secants (iteratively reweighted least squares) beside it."""
+"""Ratio of pivots of a Hessian below which secants (iteratively reweighted least squares) are added to it."""
 FEWER, LEAST_SECANTS = 0.1, 1e-8
-"""Factor on the secants after a full step, and their least part."""
+"""Factor on the added secants after a full step, and its lower bound."""
 SCALED = ("AddExpression", "multiply", "MulExpression", "DivExpression", "reshape", "Promote")
-"""Expressions of which entry i depends on entry i of their arguments."""
+"""Expressions whose entry i depends only on entry i of their arguments."""
 JUMP = 1e-3
-"""Part of the slope's total variation above which a jump counts."""
+"""Least jump of the slope that counts, relative to its total variation."""
 PROBES = 64
-"""Entries at which kinks are looked for."""
+"""Number of entries at which non-smooth points are sought."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Equations A z ~ b, (m, n) and (m,), with the QR factor of [A b], or of what a quadratic loss squares.
+    """Equations A z ~ b, (m, n) and (m,), with the QR factor of [A b], or of the equations in a quadratic loss.
 
-    ``counts`` (N,) are the numbers of equations of configurations, which stand together; None where the loss gets
+    ``counts`` (N,) are the numbers of equations of the configurations, which are contiguous; None if the loss gets
     equations.
     """
 
@@ -95,7 +95,7 @@ class Rows:
     def combined(self, U: Array, u: Array) -> Array:
         """Return the sums of u_i U_i over the equations i of each configuration (N, n), from U (m, n) and u (m,)."""
         each = len(u) // len(self.starts)
-        if each * len(self.starts) == len(u) and (np.diff(self.starts) == each).all():  # in a ninth of the time
+        if each * len(self.starts) == len(u) and (np.diff(self.starts) == each).all():  # nine times as fast
             return np.einsum("ikn,ik->in", U.reshape(-1, each, U.shape[1]), u.reshape(-1, each))
         return np.add.reduceat(U * u[:, None], self.starts)
 
@@ -202,13 +202,13 @@ class Newton:
         at, T, weight = self.canonical.at, self.rows.whitened[1], self.weight
         self.x = x
         r = self._residual(z)
-        size = max(min(abs(self._total(r)), float(len(r))), TINY)  # outliers do not loosen it
+        size = max(min(abs(self._total(r)), float(len(r))), TINY)  # outliers do not loosen the tolerance
         secants, t_before = 0.0, 0.0
         for _ in range(most):
             gradient, H = self._model(r, h)
             pivots = np.diag(np.linalg.cholesky(H + PROXIMAL * np.trace(H) * np.eye(len(H))))
             if secants or pivots.min() < POOR * pivots.max():
-                # squares with the loss's slopes at r and -r lie nowhere below it
+                # squares with the loss's slopes at r and -r are nowhere below it
                 secants = max(secants, LEAST_SECANTS) if t_before == 1.0 else 1.0
                 v = np.where(np.abs(r) > TINY, r, TINY)
                 secant = np.maximum((self._slope(v, h) - self._slope(-v, h)) / (2 * v), 0.0)
@@ -235,14 +235,14 @@ class Newton:
             z = z + t * d
             r = r + t * Ad
             self.x = self.x + t * (ahead - self.x)
-            # the model's error along the step says what the next one could gain
+            # the model's error along the step predicts the gain of the next one
             if (t == 1.0 and predicted * left**2 <= 0.01 * tolerance * size) or t * np.abs(d).max() < 1e-15:
                 break
         return z
 
     def _search(self, r: Array, Ad: Array, chord: float, bend: float, h: float, before: float) -> tuple[float, float]:
         """Return t in (0, 1] where the derivative along the step is small, and how small: no value of it is needed."""
-        if before >= 0:  # rounding: no descent is left
+        if before >= 0:  # rounding: no descent direction
             return 0.0, 0.0
         low, high, t = 0.0, 1.0, 1.0
         slope_low, slope_high = before, 0.0
@@ -276,7 +276,7 @@ class Newton:
             before, z_before, x_before = total + self._others(z, self.x), z, self.x
             size = max(abs(total), TINY)
             z = self.smooth(z, self.x, h, max(SMOOTHED * added / size, DECREASE), 30)
-            if self._value(z, self.x) > before + 2 * added + 1e-12 * abs(before):  # below what rounding lets pass
+            if self._value(z, self.x) > before + 2 * added + 1e-12 * abs(before):  # more than rounding
                 self.x = x_before
                 return z_before, h
             if added <= 0:
@@ -353,10 +353,10 @@ def gram(A: Array, weights: Array) -> Array:
 
 
 class Loss:
-    """A loss f(v) that is not quadratic, of residuals v (M,), or where ``positive`` of configurations' norms.
+    """A loss f(v) that is not quadratic, of residuals v (M,), or if ``positive`` of configurations' norms.
 
-    Where it is ``separable``, f(v) = sum_i f_i(v_i); else, where ``entries`` are known, the sum of so many of the
-    ``largest`` f_i(v_i): one of minimax, k of a CVaR.
+    If ``separable``, f(v) = sum_i f_i(v_i); otherwise, if ``entries`` is known, the sum of that many ``largest``
+    f_i(v_i): one for minimax, k for a CVaR.
     """
 
     def __init__(self, expression: Any, variable: Any, positive: bool):
@@ -434,7 +434,7 @@ class Loss:
             low, slope_low = np.where(left, low, middle), np.where(left, slope_low, at)
         jump = slope_high - slope_low
         kink = float(jump.max()) if (jump > JUMP * total).any() else 0.0
-        if self.positive:  # f(|r|) is not smooth where f rises at once
+        if self.positive:  # f(|r|) is not smooth at zero if f has a slope there
             at_zero, far = (float(self.slope(np.full(self.variable.size, at)).max()) for at in (1e-12 * size, size))
             kink = max(kink, at_zero) if at_zero > 1e-3 * far else kink
         return kink
@@ -448,9 +448,9 @@ LARGEST: dict[str, Any] = {"max": lambda a: a, "sum_largest": lambda a: a, "norm
 
 
 def _entries(e: Any, v: Any, atoms: dict[str, Any]) -> Any:
-    """Return the entrywise expression (M,) that a scalar one sums, all entries or the largest, or None.
+    """Return the entrywise expression (M,) of a scalar that sums all or the largest entries, or None.
 
-    ``atoms`` are SUMS or LARGEST; what v does not change is left out.
+    ``atoms`` are SUMS or LARGEST; terms that do not depend on v are dropped.
     """
     name = type(e).__name__
     if e.size != 1 or not has(e, v):

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from rpim_opt.convex.structure import Structure
 
 GENERATIONS = 40
-"""Working sets of entries before all rows are taken."""
+"""Most working sets of entries before all rows are used."""
 GAP = 1e-8
-"""By how much an entry may be above the largest one of the working set, relative."""
+"""Relative amount by which an entry may exceed the largest one of the working set."""
 
 
 @dataclass(eq=False)
@@ -63,16 +63,16 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
     quadratic                    the small program of its QR factor
     separable, few entries       all rows in Clarabel, where that is quicker
     separable, smooth            proximal Newton, a sequence of small programs
-    separable, non-smooth        the same on the smoothed loss, then rows where it bends
-    the largest entries          those entries that are the largest on the way
+    separable, non-smooth        the same on the smoothed loss, then exact rows near non-smooth points
+    the largest entries          a working set of the largest entries
     any other                    all rows in Clarabel
     ============================ ===================================================
 
-    Of quadratic losses and penalties without constraints or damping `Program.solve` knows a formula.
-    Penalty and constraints select what solves a small program of n + 1 rows: an active set where they are linear or
-    quadratic, else Clarabel. Entries are equations, or configurations where the loss gets their norms.
+    For quadratic losses and penalties without constraints or damping `Program.solve` has a closed form. Penalty and
+    constraints select the solver of a small program (n + 1 rows): an active-set method if they are linear or quadratic,
+    otherwise Clarabel. Entries are equations, or configurations if the loss gets their norms.
 
-    Unsolved where no minimum is found, also by a small program of proximal Newton: then CVXPY solves all rows
+    Unsolved if no minimum is found, also for a small program of proximal Newton: CVXPY then solves all rows
     (`Program.solve`).
     """
     with warm.lock:
@@ -92,8 +92,8 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
 
 def _by_newton(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
     few = loss.variable.size <= FEW_ENTRIES
-    # piecewise linear: one program of all rows; piecewise quadratic: the same where Newton's first small programs would
-    # need cones, too, or begin with an unknown active set
+    # piecewise linear: one program of all rows; piecewise quadratic: the same if Newton's first small programs need
+    # cones, or start with an unknown active set
     begun = warm.z is not None
     quick = begun or (warm.canonical.polyhedral and warm.canonical.size == len(warm.canonical.at))
     if few and (loss.expression.is_pwl() or (loss.piecewise_quadratic and not quick)):
@@ -134,9 +134,9 @@ def _all_rows(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: D
 
 
 def _by_largest(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
-    """Return the minimum of the largest entries (minimax, CVaR) by a working set; of other losses all rows are taken.
+    """Return the minimum of the largest entries (minimax, CVaR) by a working set; of other losses all rows are used.
 
-    The largest of some entries bound those of all from below; those that are above them then are added.
+    The largest of some entries are a lower bound for those of all; entries that exceed them are then added.
     """
     n, at = rows.A.shape[1], warm.canonical.at
     if loss.variable.size <= FEW_ENTRIES or loss.entries is None:
@@ -153,7 +153,7 @@ def _by_largest(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping:
             small = rows.program(loss, working, warm.canonical, len(terms.y))
         try:
             point = small.solve(terms, weight, *rows.equations(working))
-        except Unsolved:  # some entries alone may be unbounded
+        except Unsolved:  # the program of some entries may be unbounded
             break
         values = loss.values(rows.entries(rows.A @ point.x[at] - rows.b))
         most = loss.total(values[working])
