@@ -25,10 +25,10 @@ from rpim_opt.robot.parameters import own_name
 
 ROUNDS = 6  # linearizations at which hyperparameters are estimated
 REQUIRED_GAIN = 6.0
-"""By how much -2 ln L must fall for an optional prior: a likelihood ratio of twenty, which by Markov's inequality one
-arm of another kind in twenty shows at most."""
-CONTRADICTED = 1e-7  # probability with which right known values are so far from the data
-OUTLIER_SEARCHES = 4  # how often outliers are looked for again without those that were found: they mask each other
+"""Decrease of -2 ln L that an optional prior needs: a likelihood ratio of twenty, which by Markov's inequality at most
+one in twenty arms of another kind reaches."""
+CONTRADICTED = 1e-7  # p-value below which known values contradict the data
+OUTLIER_SEARCHES = 4  # repetitions of the outlier search without outliers found before: they mask each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Estimated:
 def estimate(problem: Source, estimator: Estimator, model: str, start: Array | None, keep: bool = False) -> Estimated:
     """Estimate hyperparameters, outliers and, with the model ``"auto"``, extensions, from a start (n,) [SI] or None.
 
-    Outliers are left out of the problem, unless the loss has to ``keep`` the rows that it knows.
+    Outliers are removed from the problem, unless the loss has to ``keep`` the rows.
     """
     try:
         return _estimate(problem, estimator, model, start, keep)
@@ -59,14 +59,14 @@ def estimate(problem: Source, estimator: Estimator, model: str, start: Array | N
 def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | None, keep: bool) -> Estimated:
     every = sampled(problem)
     p = every.parameters
-    if start is None:  # frames registered to the data, the robot nominal
+    if start is None:  # frames registered to the data, nominal robot
         start = np.zeros(len(p.free))
         frames = p.placed & p.identified
         if frames.any():
             start[p.placed[p.identified]] = ridge_deviations(every.identifying(frames))
     whole = estimator.fit(every, start, None, ROUNDS)
     notes: tuple[str, ...] = ()
-    if estimator.prior.optional:  # left out where the marginal likelihood is against it
+    if estimator.prior.optional:  # omitted if the marginal likelihood is against it
         plain = replace(estimator, prior=estimator.prior.without_optional())
         without = plain.fit(every, start, None, ROUNDS)
         fall = without.point.value - whole.point.value
@@ -103,10 +103,10 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
 
 
 def _contradicted(fit: Fit) -> Iterator[str]:
-    """Say which known values are off: single ones, or several of one kind of frame that are unlikely together.
+    """Report contradicted known values: single ones, or several of one kind of frame that are unlikely together.
 
-    With mean z and covariance C of a fit without the statements R z = v +- 1, but with their local variances, as a
-    joint zero far off is no reason against a frame, chi-squared falls most without those that are off::
+    z and C are mean and covariance of a fit without the statements R z = v +- 1, but with their local variances: a
+    joint zero far off does not contradict a frame. Named are the values without which chi-squared decreases most::
 
         chi-squared = d' S^-1 d,    d = R z - v,    S = 1 + R C R'
     """
@@ -141,7 +141,7 @@ def _contradicted(fit: Fit) -> Iterator[str]:
             largest = np.abs(factors).max()
             unit, si = display(known[i].dimensions[int(np.abs(factors).argmax())])
             amounts.append(f"{amount / largest / si:+.3g} {unit}")
-            if known[i].reference is None:  # a frame that is not stated has a nominal place that was found
+            if known[i].reference is None:  # the nominal place of such a frame comes from registration
                 nominal = factors @ p.nominal[[p.names.index(name) for name in known[i].names]]
                 text += f" (nominal: {nominal / largest / si:.5g} {unit})"
             named.append(text)
@@ -168,7 +168,7 @@ def _without_outliers(
 
     def explain(outliers: Mapping[str, float], last: _Explained) -> _Explained:
         fit = whole
-        if last.gain > 0:  # curves that were admitted beside other outliers stay
+        if last.gain > 0:  # curves that were admitted with other outliers stay
             rows = last.fit.problem.on(every.data).without(outliers)
             return last._replace(fit=last.fit.estimator.fit(rows, last.fit.x, last.fit.point.logs, ROUNDS))
         if outliers:
@@ -180,11 +180,11 @@ def _without_outliers(
 
     outliers = outlier_candidates(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
     now = explain(outliers, _Explained(whole))
-    for _ in range(OUTLIER_SEARCHES):  # what extensions explain, and the worst outliers, stood before the smaller ones
+    for _ in range(OUTLIER_SEARCHES):  # extensions and the largest outliers hide smaller outliers
         fit = now.fit
         if not outliers and not (now.trials and now.trials[0].extensions):
             break
-        if now.gain > 0:  # a resistant fit with hundreds of coefficients would take up outliers itself
+        if now.gain > 0:  # a resistant fit with hundreds of coefficients would absorb outliers
             more = isolated(fit.laid.on(every.data), fit.x)
         else:
             more = outlier_candidates(fit.problem.on(every.data), fit.x, fit.laid.parameters.free.scale, fit.spare)

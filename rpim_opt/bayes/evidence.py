@@ -21,38 +21,38 @@ CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1
 CURVES = {"transmission size": (1e-4, 2.0), "transmission length": (0.2, 1.5)}
 """Hyperparameters of transmission errors: prior median [rad], and standard deviation of the natural logarithm."""
 WAVES, WAVES_LENGTH = 1.5e-4, 1.0
-"""Standard deviation and length scale [rad] of the waves beside them, which are not estimated: part of a joint's range
-hardly distinguishes them from its offset and eccentricity."""
+"""Standard deviation and length scale [rad] of additional waves, which are not estimated: within a part of a joint's
+range they resemble its offset and eccentricity."""
 NOISE_SD, GEOMETRY_SD, EXTENSION_SD = 2.0, 3.0, 2.0  # prior standard deviations of hyperparameters' logarithms
-BASE_SD = 1.0  # that of the base: wider, eight configurations take it for nearer than it is
+BASE_SD = 1.0  # of the base's: with a wider one, eight configurations make it appear closer than it is
 RATIO_SD = 1.0
-"""That of the ratio of two scales of the geometry: lengths, angles and joint offsets are made by different means, but
-few data do not identify each scale alone."""
+"""Of the ratio of two geometric scales: lengths, angles and joint offsets are made by different means, but few data do
+not identify each scale alone."""
 FARTHEST = 7.0  # logarithms of hyperparameters farther from their prior medians are implausible
-SETTLED, MOST_ROUNDS = 1e-8, 500  # largest change of logarithms of local variances at their fixed point; iterations
+SETTLED, MOST_ROUNDS = 1e-8, 500  # largest change of ln(local variance) at the fixed point; iterations
 STEEPEST = 0.8  # bound on the slope of a local variance's map: its steps are at most five times the map's
 COUPLED, LONGEST_COUPLED = 0.3, 1.0
-"""Changes of logarithms of local variances below which their steps are Newton's, coupled; the longest of those."""
-FEW = 60  # configurations up to which several optima are looked for
-BASIN = 0.3  # logarithms of hyperparameters within which two optima are one
+"""Changes of ln(local variance) below which steps are coupled Newton steps; the longest of these."""
+FEW = 60  # configurations up to which several optima are sought
+BASIN = 0.3  # ln(hyperparameters) closer than this are one optimum
 FIRST_RADIUS, LARGEST_RADIUS = 2.0, 3.0
-"""Trust region of the logarithms of hyperparameters: how far the first step and any other may go."""
+"""Trust region of ln(hyperparameters): radius of the first step, and largest radius."""
 WIDEST = 1e8
-"""Upper bound on local variances, and on them over the square of a scale above 1; above it, unobservable combinations
-are rounding."""
+"""Upper bound on local variances, also divided by a squared scale above 1; above it, unobservable combinations are
+rounding."""
 RIDGE = 1e-13  # added to the scaled information matrix against rounding in unobservable directions
 PRECISIONS = np.linspace(-14.0, 8.0, 200)
-"""Logarithms of the precisions, times a squared scale, of the normals that nearly all of a t_3 is a mixture of."""
-MOST_WIDENED = 100.0  # bound on the factor of tails on a local variance, where data contradict them
-SHOWN = 6.0  # fall of -2 ln L, a likelihood ratio of twenty, from which such a factor is not chance
-FACTORS = np.geomspace(1.0, 30.0, 100)  # on the covariance of deviations, compared for what the model lacks
+"""Logarithms of precision times squared scale of the normals whose mixture approximates a t_3."""
+MOST_WIDENED = 100.0  # bound on the factor by which tails widen a local variance that data contradict
+SHOWN = 6.0  # decrease of -2 ln L, a likelihood ratio of twenty, above which such a factor is not chance
+FACTORS = np.geomspace(1.0, 30.0, 100)  # trial factors on the covariance of deviations for model errors
 
 
 class Spectrum(NamedTuple):
     """Prior variances of Fourier coefficients that represent Gaussian processes with Matern covariance (3/2).
 
-    The sum of size^2 8 r^3 / (r^2 + w^2)^2 / measure, r = sqrt(3) / length, over ripple, which is estimated, and
-    `WAVES`; squared frequencies and measures are (c,).
+    They are the sum of size^2 8 r^3 / (r^2 + w^2)^2 / measure, r = sqrt(3) / length, over `WAVES` and the ripple, which
+    is estimated; squared frequencies and measures are (c,).
     """
 
     w2: Array = np.zeros(0)
@@ -79,9 +79,9 @@ class Spectrum(NamedTuple):
 class Hierarchy:
     """Hierarchical prior of p deviations, in units of their scales.
 
-    Normal, those ``heavy`` (p,) Student's t with ``tails`` degrees of freedom, those ``replaced`` (p,) without a prior
-    of their own. The scale of a group ``names[group]`` (p,) multiplies a deviation's, none at -1. The last deviations
-    may have a ``spectrum``. rows z - values ~ N(0, I) besides.
+    Deviations are normal, those ``heavy`` (p,) Student's t with ``tails`` degrees of freedom, those ``replaced`` (p,)
+    without an own prior. A deviation's scale is multiplied by that of its group ``names[group]`` (p,), except for group
+    -1. The last ones may have a ``spectrum``. In addition, rows z - values ~ N(0, I).
     """
 
     group: np.ndarray
@@ -179,8 +179,8 @@ class Point:
     """The marginal likelihood at logarithms of hyperparameters (s,): scales of deviations, then q of noise.
 
     ``value`` is -2 ln of the restricted likelihood and of the hyperprior. ``z`` (p,), ``C`` (p, p) are posterior mean
-    and covariance of the deviations, ``v`` (p,) the variances of a Tikhonov program with these. Derivatives are taken
-    when they are asked for: each order costs as much as all before.
+    and covariance of the deviations, ``v`` (p,) their variances in an equivalent Tikhonov program. Derivatives are
+    computed on demand: each order costs as much as all lower ones.
     """
 
     evidence: Evidence
@@ -229,7 +229,7 @@ class Point:
             X, residual = part.X.reshape(-1, p), part.y - part.X @ self.z
             moved = (part.noise @ residual[:, :, None]).reshape(q, len(X))
             f += moved @ X
-            XC = (X @ self.C).reshape(part.X.shape)  # one product: those of configurations take three times as long
+            XC = (X @ self.C).reshape(part.X.shape)  # one product: one per configuration takes three times as long
             products.append(XC)
             weighed = part.noise - 2 * XC @ part.X.transpose(0, 2, 1) @ part.noise
             gradient += np.einsum("ankk->a", part.noise + weighed) / 2 - moved @ residual.ravel()
@@ -252,7 +252,7 @@ class Point:
         for part in self.parts:
             values, U = np.linalg.eigh(part.noise)
             roots = np.sqrt(np.maximum(values, 0.0))[..., None] * U.transpose(0, 1, 3, 2)
-            for a, root in enumerate(roots):  # products of a matrix with itself take half the time
+            for a, root in enumerate(roots):  # products of a matrix with its own transpose take half the time
                 half = (root @ part.X).reshape(-1, p)
                 M[a] += half.T @ half
         M = self.C @ M
@@ -267,7 +267,7 @@ class Point:
         size2, of_size, bend = prior.variances(self.logs)
         by_noise, f, among, _ = self._by_noise
         twice, C_by_noise = self._weighed_twice()
-        # how the mean follows noise, and e^2 at constant local variances
+        # derivatives of the mean by noise, and of e^2 at constant local variances
         z_by_noise = -C @ f.T
         direct = np.zeros_like(of_size)
         direct[:, s:] = C_by_noise + 2 * z[:, None] * z_by_noise
@@ -311,7 +311,7 @@ class Evidence:
                                        + 1 - (z^2 + C) / v
 
     and logarithms of hyperparameters are normal around those of `CENTRES` and 1 (`Hierarchy.covariance`). Student's t
-    enters by its mean field (a variational bound); a deviation that nothing decides adds nothing.
+    enters by its mean field (a variational bound); an undetermined deviation contributes nothing.
 
     Derivatives, with P = R^-1 - R^-1 X C X'R^-1, u = R^-1 (y - X z), R_a = dR / da and e^2 = z^2 + diag C::
 
@@ -319,13 +319,13 @@ class Evidence:
         dC      = C diag(dln v / v) C  +  C X'R^-1 R_a R^-1 X C da
         dln v_j = (2 nu tau^2 dln tau + de_j^2) / ((nu + 1) v_j)    heavy ones;    2 dln tau    others
 
-    A scale's slope is the sum of 2 nu (tau^2 / v - 1) over its heavy deviations and of 2 (1 - e^2 / v) over others;
-    that of a noise is tr(P R_a) - u'R_a u, and by noises a and b the value has the second derivatives of variance
-    components (Gilmour, Thompson and Cullis 1995) and what local variances add::
+    The derivative by a scale is the sum of 2 nu (tau^2 / v - 1) over its heavy deviations and of 2 (1 - e^2 / v) over
+    others, by a noise tr(P R_a) - u'R_a u; by noises a and b the second derivative is that of variance components
+    (Gilmour, Thompson and Cullis 1995) and a term of local variances::
 
         2 u'R_a P R_b u - tr(P R_a P R_b) + tr(P R_ab) - u'R_ab u - sum (de^2 / da at constant v) (dln v / db) / v
 
-    ``noise`` names the parts of the noise that are estimated (`CENTRES`), ``fixed`` has the others.
+    ``noise`` names the estimated parts of the noise (`CENTRES`), ``fixed`` has the others.
     """
 
     data: Linearized
@@ -377,8 +377,8 @@ class Evidence:
     def optima(self, starts: Sequence[Array | Point], accuracy: float = 1e-5) -> list[Point]:
         """Return the local optima reached from some starts, logarithms (s,) or points there, the best first.
 
-        By Newton's steps in a trust region (Conn, Gould and Toint 2000), to the first point where no slope by the
-        logarithms is above the accuracy: its value may be above that of the one before by rounding.
+        Newton's method in a trust region (Conn, Gould and Toint 2000) ends at the first point where no derivative by
+        the logarithms exceeds the accuracy: by rounding, its value may exceed the previous one.
         """
         known: list[Point] = []
 
@@ -387,7 +387,7 @@ class Evidence:
             if not np.array_equal(logs, last.logs):
                 last = self.at(logs.copy(), last)
             if np.linalg.norm(last.gradient) <= accuracy:
-                raise StopIteration  # SciPy's own test waits for the next step that lowers the value
+                raise StopIteration  # SciPy's test waits for another decrease
             return last
 
         for start in starts:
@@ -411,7 +411,7 @@ class Evidence:
         noisy = 3.0 * np.isin(self.names, self.noise)
         geometry = 2.0 * np.isin(np.arange(len(self.centre)), self.prior.geometry)
         starts = [self.centre + noisy, self.centre, self.centre + geometry]
-        starts = [*{start.tobytes(): start for start in starts}.values()]  # each once
+        starts = [*{start.tobytes(): start for start in starts}.values()]  # without duplicates
         return starts if sum(len(stack.index) for stack in self.data.stacks) <= FEW else starts[:1]
 
     def restricted(self, keep: np.ndarray) -> Evidence:
@@ -421,10 +421,10 @@ class Evidence:
     def overdispersion(self, point: Point, q: Array) -> Array:
         """Return the factors k >= 1 (joints,) by which the covariance C is too small, with joint values q (m, joints).
 
-        What a model lacks repeats from row to row, so that C, which takes it for chance, is too small; inside the
-        measured ranges the noise covers it. Equations in either half of a joint's range predict those in the other one
-        with errors e of covariance I + k X C X', C as that half alone leaves it; k has the largest product of both
-        likelihoods. It is 1 where the likelihood of all joints together does not rise by a factor of twenty with one k.
+        Model errors are systematic, but C treats them as random, so that it is too small outside of the measured
+        ranges; inside, the noise covers them. Equations in one half of a joint's range predict those in the other half
+        with errors e of covariance I + k X C X', with C from the first half alone; k maximizes the product of both
+        likelihoods. It is 1 unless the likelihood of all joints together rises by a factor of twenty with a common k.
         """
         X = np.vstack([part.X.reshape(-1, len(point.v)) for part in point.parts])
         y = np.concatenate([part.y.reshape(-1, 1) for part in point.parts])
@@ -432,7 +432,7 @@ class Evidence:
         q = q[np.concatenate([stack.index.ravel() for stack in self.data.stacks])]
         lower = (q <= np.median(q, axis=0)).T
         value = np.zeros((len(lower), len(FACTORS)))
-        for joint in np.flatnonzero(~lower.all(axis=1)):  # of those that moved
+        for joint in np.flatnonzero(~lower.all(axis=1)):  # of joints that moved
             for half in (lower[joint], ~lower[joint]):
                 inside, beyond = X[half], X[~half]
                 L, d = _factored(inside.T @ inside + rows.T @ rows, own)
@@ -473,7 +473,7 @@ class Evidence:
     def _known(self, H: Array, h: Array, size2: Array, v: Array) -> tuple[Array, Array, float, Array]:
         """Return z, C, -ln|C| and v of all but curves, from their information matrix H and vector h.
 
-        Local variances of Student-t deviations are a fixed point, found by Newton's steps for ln v:
+        Local variances of Student-t deviations are a fixed point, found by Newton's method for ln v:
         d C_ij / d v_k = C_ik C_kj / v_k^2, d z_j / d v_k = C_jk z_k / v_k^2.
         """
         heavy, tails = self.heavy, self.prior.tails
@@ -493,7 +493,7 @@ class Evidence:
             rounds += 1
             if largest <= SETTLED or rounds == MOST_ROUNDS:
                 return z, C, logdet, v
-            step = change  # which always leads downhill, slowly
+            step = change  # always a descent direction, but slow
             if largest < before:
                 step = _step(change, C_heavy * (C_heavy + 2 * np.outer(z_heavy, z_heavy)), weighed, local)
             local = np.minimum(local * np.exp(step), widest)
@@ -524,7 +524,7 @@ def _half_solved(factor: Array, d: Array, right: Array) -> Array:
 def _inverse(factor: Array, d: Array) -> tuple[Array, float]:
     """Return M^-1 and ln|M| from Cholesky's factor, which is overwritten."""
     logdet = 2 * float(np.sum(np.log(factor.diagonal() / d)))
-    lower, _ = _potri(factor, lower=1)  # its upper half is zero, as Cholesky's left it
+    lower, _ = _potri(factor, lower=1)  # its upper half is zero, from Cholesky
     C = lower + lower.T
     C.flat[:: len(d) + 1] /= 2
     C *= d[:, None] * d
@@ -553,9 +553,9 @@ def _eliminated(U: Array, equations: Array, v: Array) -> tuple[Array, Array, Arr
 
 
 def _step(change: Array, M: Array, weighed: Array, v: Array) -> Array:
-    """Return a step in ln v (n,) to where the changes that the map asks for are zero; they follow v by M / weighed / v.
+    """Return a step in ln v (n,) towards a zero of the map's changes, whose derivatives by v are M / weighed / v.
 
-    Newton's where the map draws near to a fixed point (the system is positive definite), else each for itself.
+    It is Newton's step if the map contracts (the system is positive definite), otherwise each component's own.
     """
     if np.abs(change).max() <= COUPLED:
         root = np.sqrt(weighed * v)
@@ -574,16 +574,15 @@ def _step(change: Array, M: Array, weighed: Array, v: Array) -> Array:
 def tail_widening(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, tails: float) -> Array:
     """Return D (p, h), where D D' widens the covariance C for Student-t deviations (h,) with scales tau (h,).
 
-    The normal of variance v_j that stands for the t_nu of a deviation j has its curvature at the mean, not its width.
-    What the data say of z_j, apart from that normal, has the precision p = 1 / C_jj - 1 / v_j and the mean
-    z_j / (C_jj p). V_j is the variance of that times t_nu, and w_j = 1 / V_j - p the precision that a normal in the
-    place of the tails needs to agree (one step of expectation propagation; means stay): D is that `without_information`
-    1 / v - w.
+    The normal of variance v_j in place of the t_nu of a deviation j has its curvature at the mean, not its width.
+    Without that normal the data determine z_j with precision p = 1 / C_jj - 1 / v_j and mean z_j / (C_jj p). V_j is the
+    variance of that density times t_nu, and w_j = 1 / V_j - p the precision of a normal that replaces the tails and
+    agrees with it (one step of expectation propagation; means stay): D is `without_information` of 1 / v - w.
     """
     c = C.diagonal()[heavy]
     local = v[heavy]
     known = np.maximum(1 / c - 1 / local, 0.0)
-    # t_nu in units of tau is a mixture of normals; the nearer to a normal, the closer their logarithms are to zero
+    # t_nu in units of tau is a mixture of normals; close to a normal, the logarithms are close to zero
     logs = PRECISIONS * np.sqrt(3 / max(tails, 3.0))
     both = (known * size**2)[:, None] + np.exp(logs)
     moved = (z[heavy] / c * size)[:, None]
@@ -600,7 +599,7 @@ def tail_widening(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, 
 
 
 def without_information(C: Array, taken: Array) -> Array:
-    """Return D (p, k), C + D D' = (C^-1 - diag(taken))^-1: the covariance without information (p,) that it contains.
+    """Return D (p, k), C + D D' = (C^-1 - diag(taken))^-1: the covariance without information ``taken`` (p,).
 
     ::
 

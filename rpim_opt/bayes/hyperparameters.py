@@ -31,16 +31,16 @@ from rpim_opt.problem.noise import Repeatability, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.terms import Curve
 
-MOST = 1000  # configurations that hyperparameters are estimated from, drawn at random where there are more
+MOST = 1000  # configurations used for hyperparameters, drawn at random from more
 SAME_SIZE, SAME_PLACE = 0.02, 0.01
-"""Largest change of the logarithms of hyperparameters, and of deviations over their scales (RMS), at the end."""
-SLOPES = 1e-2, 1e-5  # of -2 ln L by logarithms of hyperparameters, at the first linearization and at later ones
-CLOSE = 0.1  # scales (RMS) up to which the posterior mean at one linearization stands for a fit
-ITERATIONS = 6  # of the first fit between two estimates, twice as many in every later one: the first change soon
-VAGUE = 1.0  # standard deviation of a logarithm from which on a scale of the geometry is hardly identified
+"""Largest change of ln(hyperparameters), and of deviations over their scales (RMS), at convergence."""
+SLOPES = 1e-2, 1e-5  # of -2 ln L by ln(hyperparameters), at the first linearization and at later ones
+CLOSE = 0.1  # scales (RMS) within which the posterior mean at one linearization replaces a fit
+ITERATIONS = 6  # of the first fit between two estimates; twice as many in later ones
+VAGUE = 1.0  # standard deviation of its logarithm above which a geometric scale is hardly identified
 FLATTEST = 0.05  # lower bound on the second derivatives of -2 ln L
 Refit = Callable[[Source, Formulation, Array, int], Array]
-"""From a problem, a formulation, a start [SI] and a number of iterations to deviations (n,) near a minimum [SI]."""
+"""From problem, formulation, start [SI] and number of iterations to deviations (n,) [SI] near a minimum."""
 
 
 class Hyperparameter(NamedTuple):
@@ -65,7 +65,7 @@ class ExcludedRow(NamedTuple):
 
     label: str
     ratio: float
-    error: float | None = None  # None where the row has neither length nor angle
+    error: float | None = None  # None if the row has neither length nor angle
     dimension: str = "length"
 
     def __str__(self) -> str:
@@ -86,16 +86,16 @@ class Transmitted(NamedTuple):
 class Learned(Brief):
     """Hyperparameters estimated from the data.
 
-    ``scales`` are those of the groups of deviations over the stated ones, ``noise`` the robot's repeatability, in
-    ``position`` [m], ``orientation`` and ``joint`` [rad], and ``instrument`` over the stated noise; ``covariance``
-    (s, s) that of the logarithms of both. ``local`` (n,) are local scales of deviations over those of their groups, 1
-    without heavy tails; ``stated`` (n,) the stated scales [SI]. ``trials`` are the models that were compared, the
-    selected one first, ``value`` is -2 ln of the restricted likelihood at the end, ``noise_dof`` the degrees of freedom
-    of the variance of a reading (Satterthwaite). D D' of ``drift`` (n, k) is what the uncertainty of hyperparameters,
-    heavy tails and what the model lacks outside of the measured ranges add to the covariance [SI]. ``left_out`` are
-    outliers that were excluded, the worst first, ``added`` parameters of model extensions, ``notes`` sentences on how
-    far the marginal likelihood decides, ``contradicted`` sentences on known values that the data contradict, and
-    ``curves`` the joints' transmission errors, None without them.
+    ``scales`` are those of the groups of deviations over the stated ones; ``noise`` is the robot's repeatability in
+    ``position`` [m], ``orientation`` and ``joint`` [rad], and ``instrument`` over the stated noise; ``covariance`` (s,
+    s) is that of the logarithms of both. ``local`` (n,) are local scales of deviations over those of their groups, 1
+    without heavy tails; ``stated`` (n,) the stated scales [SI]. ``trials`` are the compared models, the selected one
+    first; ``value`` is the final -2 ln of the restricted likelihood, ``noise_dof`` the degrees of freedom of a
+    reading's variance (Satterthwaite). ``drift`` (n, k) is D, where D D' is the covariance [SI] due to uncertain
+    hyperparameters, heavy tails, and model errors outside the measured ranges. ``left_out`` are excluded outliers, the
+    worst first, ``added`` parameters of model extensions, ``notes`` sentences on what the marginal likelihood leaves
+    undecided, ``contradicted`` sentences on known values that the data contradict, and ``curves`` the joints'
+    transmission errors, None without them.
     """
 
     scales: Mapping[str, Hyperparameter]
@@ -143,8 +143,8 @@ class Fit:
     """A problem with hyperparameters applied, and its linearization point.
 
     ``problem`` has its stated scales and the prior ``stated``; ``evidence`` is the last marginal likelihood, ``point``
-    its optimum, ``others`` those that were reached from other sides. ``laid`` is the problem with local scales and
-    noise, ordinary Tikhonov at weight 1, and ``x`` (n,) its solution [SI], by this ``estimator``.
+    its optimum, ``others`` are further optima. ``laid`` is the problem with local scales and noise, an ordinary
+    Tikhonov problem at weight 1, and ``x`` (n,) its solution [SI], by this ``estimator``.
     """
 
     problem: CalibrationProblem
@@ -182,8 +182,8 @@ class Fit:
 class Estimator:
     """Estimator of hyperparameters, with a prior and the variance components to estimate.
 
-    ``refit`` continues a Tikhonov fit at weight 1 from one linearization; without it the posterior mean stands for one.
-    The coefficients of ``curves``, transmission errors of joints, are the last parameters of a problem.
+    ``refit`` continues a Tikhonov fit at weight 1 from one linearization; without it the posterior mean is used
+    instead. The coefficients of ``curves``, transmission errors of joints, are the last parameters of a problem.
     """
 
     prior: Prior
@@ -223,8 +223,8 @@ class Estimator:
     def fit(self, problem: CalibrationProblem, x: Array, before: Array | None, rounds: int) -> Fit:
         """Alternate hyperparameters and deviations to a fixed point, with a limited number of linearizations.
 
-        From x (n,) [SI] and logarithms of hyperparameters, or None. Several optima are all continued, since where few
-        data leave frames far from their start, their order changes with the linearization.
+        The start is x (n,) [SI], with logarithms of hyperparameters or None. All of several optima are continued: with
+        few data and frames far from their start, their order changes with the linearization.
         """
         first = self._once(problem, x, before, 0)
         fits = [first, *(self._once(problem, x, other.logs, 0) for other in first.others)]
@@ -263,7 +263,7 @@ def spectrum_of(curves: Sequence[Curve], unit: Array) -> Spectrum:
         own = np.append(np.arange(1.0, curve.waves + 1), step * np.arange(1, curve.harmonics + 1))
         between = np.concatenate([[own[0] / 2], (own[1:] + own[:-1]) / 2, [own[-1] + step / 2]])
         w += [own, own]
-        share += [np.diff(between) / (2 * np.pi)] * 2  # a coefficient stands for the frequencies nearest to its own
+        share += [np.diff(between) / (2 * np.pi)] * 2  # a coefficient represents the frequencies closest to its own
     frequencies = np.concatenate(w)
     return Spectrum(frequencies**2, unit[len(unit) - len(frequencies) :] ** 2 / np.concatenate(share))
 
@@ -298,10 +298,10 @@ def _distance(x: Array, before: Array, laid: CalibrationProblem) -> float:
 
 
 def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
-    """Return the hyperparameters of a fit with their standard errors; ``gain`` is the gain by transmission errors.
+    """Return the hyperparameters of a fit with their standard errors; ``gain`` is the decrease by transmission errors.
 
-    Their covariance (s, s) is twice the inverse of the second derivatives of -2 ln L, and the variance V of a reading
-    has Satterthwaite's degrees of freedom 2 V^2 / var(V), at least three.
+    Their covariance (s, s) is twice the inverse of the second derivatives of -2 ln L; the variance V of a reading has
+    Satterthwaite's degrees of freedom 2 V^2 / var(V), at least three.
     """
     evidence, point, prior = fit.evidence, fit.point, fit.evidence.prior
     curvature, U = np.linalg.eigh((point.curvature + point.curvature.T) / 2)
@@ -319,7 +319,7 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         return sum(float(np.sum(part[read])) for part, read in zip(parts, reads, strict=True))
 
     growth = point.falls(point.C @ (X.T @ X) @ point.C)
-    for i, kind in enumerate(evidence.noise, len(growth) - len(evidence.noise)):  # R is a sum of squares of the noises
+    for i, kind in enumerate(evidence.noise, len(growth) - len(evidence.noise)):  # R is a sum of squared noises
         growth[i] += 2 * (variance(repeatability) - variance(replace(repeatability, **{kind: 0.0})))
     growth = growth / (float(np.sum((X @ point.C) * X)) + variance(repeatability))
     values = [Hyperparameter(float(v), float(s)) for v, s in zip(np.exp(point.logs), spread, strict=True)]
@@ -342,15 +342,15 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     if m < n:
         rest = f"at least {n - m} parameter combinations are unidentifiable."
         notes.append(f"{m} equations for {n} parameters: {rest}")
-    # the base was registered with the nominal robot: that it is near to there, by which its scale is estimated, does
-    # not say what of joint 1 the registration has taken up; only the stated scale does
+    # the base was registered with the nominal robot: its distance from there, from which its scale is estimated, does
+    # not show what the registration absorbed of joint 1; only the stated scale does
     of_base = np.array([*prior.names, ""])[prior.group] == BASE
     taken = np.where(of_base & ~prior.replaced, np.maximum(1 / point.v - 1, 0.0), 0.0)
     widened = without_information(point.C, taken)
     C = point.C + widened @ widened.T
     drift = [point.slopes @ root, widened]
     drift.append(tail_widening(point.z + C @ (taken * point.z), C, point.v, heavy, scales, prior.tails))
-    if not len(prior.spectrum.w2):  # curves have a prior of their own; a prediction may leave the range of any joint
+    if not len(prior.spectrum.w2):  # curves have an own prior; a prediction may leave the range of any joint
         factors = evidence.overdispersion(point, fit.problem.joint_values[fit.problem.owners])
         drift.append(widening(point.C, factors.max()))
     curves = None

@@ -22,24 +22,24 @@ from rpim_opt.robot.extensions import extension_scales, model_extensions
 from rpim_opt.robot.parameters import EXPANSION, frame_of, of_session, own_name, session_prefix
 
 FIRST, SECOND, MOMENTS = "first harmonic", "second harmonic", "moments"
-TURNED = {FIRST: 2.0, SECOND: 4.0}  # travel [rad] from which a joint's harmonics are looked for: less fails elsewhere
-MANY = 40  # configurations from which on first moments and second harmonics are compared
-CANDIDATES = ((), ("gravity",), (FIRST,), ("gravity", FIRST))  # the models of the arm that are compared first
-FURTHER = {MOMENTS: "gravity", SECOND: FIRST}  # asked for one by one, and what each stands beside
-ARM = ("gravity", FIRST, SECOND, MOMENTS)  # all extensions of the arm, in the order in which they are said
-SESSIONS = "sessions"  # the extension by what the readings of a session have in common, which is none of the arm
-WARMTH = "temperature"  # the extension by what grows with temperature
-CONDITIONS = (SESSIONS, WARMTH)  # extensions by how and when was measured; each is a question of its own
+TURNED = {FIRST: 2.0, SECOND: 4.0}  # travel of a joint [rad] from which its harmonics are tried: less fails elsewhere
+MANY = 40  # configurations from which first moments and second harmonics are compared
+CANDIDATES = ((), ("gravity",), (FIRST,), ("gravity", FIRST))  # models of the arm that are compared first
+FURTHER = {MOMENTS: "gravity", SECOND: FIRST}  # tried one by one, each with the extension that it needs
+ARM = ("gravity", FIRST, SECOND, MOMENTS)  # extensions of the arm, in the order of reports
+SESSIONS = "sessions"  # the extension by session offsets, none of the arm
+WARMTH = "temperature"  # the extension by thermal expansion
+CONDITIONS = (SESSIONS, WARMTH)  # extensions by measuring conditions, each tried separately
 GAIN = 5.0
-"""By how much -2 ln L over its overdispersion (QAIC, Burnham and Anderson 2002) must fall for a model with extensions.
+"""Decrease of -2 ln L over its overdispersion (QAIC, Burnham and Anderson 2002) required of a model with extensions.
 
-Of 120 simulated arms without them none gained 4. For sessions and for temperature once more each: other questions."""
-LARGE = 3.0  # logarithm of a new scale over its prior median where an optimum is looked for
-COMPARED = 1e-2  # slopes of -2 ln L by the logarithms of hyperparameters at which models are compared
+None of 120 simulated arms without extensions gained 4. It holds again for sessions, and for temperature."""
+LARGE = 3.0  # ln(new scale over its prior median) at which the search for an optimum starts
+COMPARED = 1e-2  # derivatives of -2 ln L by ln(hyperparameters) at which models are compared
 ROUNDS = 3  # linearizations at which the hyperparameters of the selected model are estimated
-SPEAK = 10.0  # fall of -2 ln L for an extension to be spoken of: false picks gain 4, none of many gained 10
-NOISE = ("position", "orientation", "joint")  # parts of the noise of a comparison at a result
-KNOWN = Prior(joint_offset=1.0, frames=1.0)  # the prior once scales were estimated: they are as the problem says
+SPEAK = 10.0  # decrease of -2 ln L for an extension to be reported: false ones gain 4, none of many gained 10
+NOISE = ("position", "orientation", "joint")  # parts of the noise in a comparison at a result
+KNOWN = Prior(joint_offset=1.0, frames=1.0)  # prior with scales estimated before, as the problem has them
 
 
 class Candidate(NamedTuple):
@@ -66,7 +66,7 @@ def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
                 names = [name for name in names if name.rpartition("_")[2].lstrip("cosin") in turned]
             candidates.setdefault(extension, []).extend(problem.parameters.called(robot, name) for name in names)
     prefixes = {session_prefix(name) for name in problem.data.sessions}
-    if 2 <= len(prefixes) <= len(np.unique(problem.data.configuration)) / 2:  # sessions differ from configurations
+    if 2 <= len(prefixes) <= len(np.unique(problem.data.configuration)) / 2:  # sessions that differ from configurations
         candidates[SESSIONS] = [n for n in problem.parameters.names if frame_of(n) in prefixes]
     grows = [n for n in problem.parameters.names if own_name(n) == EXPANSION]
     if grows and np.ptp(problem.data.temperatures) > 0:
@@ -131,8 +131,8 @@ class Models:
     def compared(self, fitted: Callable[[tuple[str, ...]], Candidate]) -> list[Candidate]:
         """Return the candidate models, each ``fitted`` to its extensions.
 
-        Extensions of the arm are selected with all conditions in the model, which would stand for them else; then of
-        the best one each condition is asked for.
+        Extensions of the arm are selected with all conditions in the model, whose effects they would otherwise absorb;
+        then each condition is tried with the best one.
         """
         conditions = tuple(condition for condition in CONDITIONS if condition in self.extensions)
         possible = [tuple(each for each in candidate if each in self.extensions) for candidate in CANDIDATES]
@@ -162,7 +162,7 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
         evidence = models.columns.restricted(models.members(candidate))
         conditions = frozenset(candidate).intersection(CONDITIONS)
         point = evidence.optima([_start(evidence, known.get(conditions, before))], COMPARED)[0]
-        if conditions and conditions == set(candidate):  # what they explain stood among the noise
+        if conditions and conditions == set(candidate):  # their effects were part of the noise
             known[conditions] = _hyperparameters(evidence, point)
         return Candidate(point.value + GAIN * complexity(candidate), candidate, evidence, point)
 
@@ -189,10 +189,10 @@ def _hyperparameters(evidence: Evidence, point: Point) -> dict[str, float]:
 
 
 def _start(evidence: Evidence, known: Mapping[str, float]) -> Array:
-    """Return where the optimum of a model is looked for, from logarithms of another's hyperparameters by name.
+    """Return a start for the optimum of a model from logarithms of another model's hyperparameters by name.
 
-    Scales of extensions begin far above their prior medians: at small scales the likelihood is flat in an extension
-    whose effect the noise has taken up.
+    Scales of extensions start far above their prior medians: at small scales the likelihood is flat if the noise has
+    absorbed the effect.
     """
     pairs = zip(evidence.names, evidence.centre, strict=True)
     return np.array([known.get(name, centre + LARGE) for name, centre in pairs])
@@ -204,7 +204,7 @@ def _start(evidence: Evidence, known: Mapping[str, float]) -> Array:
 class Comparison(Models):
     """Models with and without extensions at the linearization of one result, whatever its weight.
 
-    Of large data `hyperparameters.MOST` configurations are used.
+    At most `hyperparameters.MOST` configurations are used.
     """
 
     def __init__(self, result: Result) -> None:
@@ -214,13 +214,13 @@ class Comparison(Models):
             estimator = Estimator(KNOWN, NOISE + ("instrument",) * ("instrument" in result.learned.noise))
         problem = sampled(result.problem.with_repeatability(None))  # in memory, without noise estimates
         rows = np.flatnonzero(np.isin(problem.labels, [flag.label for flag in result.flagged]))
-        if 0 < len(rows) <= len(problem.labels) / 4:  # without flagged rows unless their neighbours are
+        if 0 < len(rows) <= len(problem.labels) / 4:  # without flagged rows, unless they are neighbours
             alone = {problem.labels[i] for i in rows[~clustered(problem, result.x, rows)]}
             problem = problem.without(alone)
         super().__init__(problem, estimator, named(result.problem, result.x))
         stacks = self.columns.data.stacks
         self.configurations = len(np.unique(self.problem.data.configuration))
-        # angles where no length was measured, pixels where a camera alone has seen
+        # angles if no length was measured, pixels if only cameras were used
         self.dimension = next(d for d in ("length", "angle", "pixel") if any(stack.of(d).any() for stack in stacks))
         self.equations = np.sort(np.concatenate([stack.index[stack.of(self.dimension)] for stack in stacks]))
         self.row = self.problem.owners
@@ -248,7 +248,7 @@ class Comparison(Models):
     def best(self) -> Candidate:
         """The selected model, with a penalty of `SPEAK` per extension."""
         learned, updated = self.result.learned, self.result.record.earlier
-        if learned is not None and learned.trials and not updated:  # it was selected then, of an update by other rows
+        if learned is not None and learned.trials and not updated:  # selected before; in an update, from other rows
             return self.plain
         candidates = self.compared(lambda some: self._fitted(some, self.members(some)) if some else self.plain)
         return min([self.plain, *candidates], key=lambda each: each.criterion)

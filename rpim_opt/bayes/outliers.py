@@ -18,22 +18,22 @@ from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import CalibrationProblem, error_dimensions
 
 BEYOND, LOOK = 6.0, 3.0
-"""Medians of the errors beyond which a position is an outlier; and from which on any is looked for."""
-FALSE_RATE = float(chdtrc(3, BEYOND**2 * chdtri(3, 0.5)))  # of a good position, of three components
-SPARE = 0.4  # part of the equations that must be left over: errors that the fit has swallowed tell nothing
-WELL_DETERMINED = 10.0  # equations a parameter from which on no single row can pull the fit to itself
+"""Error of an outlier in medians, and error from which outliers are sought."""
+FALSE_RATE = float(chdtrc(3, BEYOND**2 * chdtri(3, 0.5)))  # of a good position with three components
+SPARE = 0.4  # share of equations that must be redundant: errors that the fit has absorbed cannot be seen
+WELL_DETERMINED = 10.0  # equations per parameter from which no single row can pull the fit to itself
 FULL_WEIGHT, STEPS = 1.5, 50
-"""Medians up to which a resistant fit gives a row its full weight; reweighted fits, at most."""
-FINEST = 1e-8  # least median error of a resistant fit [m, rad, pixels]: fewer rows than parameters leave none
-SAME = 1e-3  # largest change of weights of rows that have converged
-RUN = 0.01  # probability with which chance makes neighbours of outliers: below, they are a cluster
+"""Error in medians up to which a row has full weight in a resistant fit; most reweighted fits."""
+FINEST = 1e-8  # least median error of a resistant fit [m, rad, pixels]: with fewer rows than parameters it is zero
+SAME = 1e-3  # largest change of row weights at convergence
+RUN = 0.01  # probability of neighbouring outliers by chance, below which they are a cluster
 NEIGHBOURS, ALIKE = 3, 0.7
-"""Outliers from which on they may be a cluster, and the cosine of errors that point the same way."""
+"""Least number of outliers in a cluster, and the cosine of errors with the same direction."""
 WIDE = 30.0
-"""Factor on prior scales, so that no prior alone makes an outlier. Chosen on 300 simulated arms with ten good
-configurations, of which 7 have an outlier then, and 40 without this test; on 300 others 7 and 41. Meant are 3."""
+"""Factor on prior scales, so that a prior alone makes no outlier. Chosen on 300 simulated arms with ten good
+configurations, of which 7 have an outlier then, 40 without this test; on 300 others 7 and 41. The target is 3."""
 UNDECIDED = 1e-5
-"""Share of a configuration's slopes along directions that the others do not decide, from which on they cannot tell."""
+"""Share of a configuration's Jacobian in directions that others do not determine, from which it cannot be judged."""
 
 
 def by_block(problem: CalibrationProblem, values: Array) -> Iterator[tuple[Block, Array]]:
@@ -58,7 +58,7 @@ def error_vectors(problem: CalibrationProblem, x: Array) -> Array:
 def largest_errors(problem: Source, x: Array) -> list[tuple[float | None, str]]:
     """Return every row's error [SI] at x (n,) [SI] in the dimension of largest ratio to the median, and that dimension.
 
-    None for rows without length and angle; what is known of a distance counts as its length.
+    None for rows without length and angle; a known distance counts as length.
     """
     dimensions = ("length", "stated length", "angle", "stated angle")
     errors = np.array([problem.errors(x, dimension) for dimension in dimensions])
@@ -71,7 +71,7 @@ def largest_errors(problem: Source, x: Array) -> list[tuple[float | None, str]]:
 def error_ratios(problem: CalibrationProblem, x: Array) -> Array:
     """Return the larger ratio (N,) of errors in length and in angle to the median of the measurement type.
 
-    Scaled to the same false rate for every type, at the deviations x (n,) [SI].
+    It is scaled to the same false rate for every type, at the deviations x (n,) [SI].
     """
     ratios = np.zeros(len(problem.data))
     for dimension in ("length", "angle"):
@@ -92,8 +92,8 @@ def error_ratios(problem: CalibrationProblem, x: Array) -> Array:
 def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
     """Return deviations (n,) [SI] of a fit that is resistant to a few outliers.
 
-    Huber's loss of the rows' errors over their own median, by reweighted squares of the linearization at x, with prior
-    scales (n,) [SI]::
+    It has Huber's loss of the rows' errors over their median, by reweighted squares of the linearization at x, with
+    prior scales (n,) [SI]::
 
         minimize    sum_i w_i |e_i|^2 / median^2 + |x / scale|^2,    w_i = min(1, FULL_WEIGHT median / |e_i|)
     """
@@ -127,7 +127,7 @@ def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
 def outlier_candidates(problem: CalibrationProblem, x: Array, scale: Array, spare: float) -> dict[str, float]:
     """Return the error over the median, by label, of rows that may be outliers of a squared fit x (n,) [SI].
 
-    Of prior scales (n,) [SI]; a part ``spare`` of the equations was left over.
+    ``scale`` (n,) are prior scales [SI]; the share ``spare`` of the equations is redundant.
     """
     ratio = error_ratios(problem, x)
     if spare < SPARE or ratio.max() < LOOK:
@@ -154,7 +154,7 @@ def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.nda
     length = np.maximum(np.linalg.norm(errors, axis=1), 1e-12)
     whose = np.array(problem.data.robot)
     together = problem.data.configuration
-    if problem.touches is not None:  # touches of a point have one number, and differ in their joint values
+    if problem.touches is not None:  # touches of a point have one number, and differ in joint values
         together = stops(q)
     for k, i in enumerate(rows):
         apart = np.sum((unit - unit[i]) ** 2, axis=1)
@@ -162,7 +162,7 @@ def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.nda
         j = int(np.argmin(apart))
         member[k] = j in rows and errors[i] @ errors[j] > ALIKE * length[i] * length[j]
     pairs = np.ceil(member.sum() / 2)  # two are each other's neighbour
-    expected = len(rows) ** 2 / len(q) * (1 - ALIKE) / 2  # dealt out at random, in random directions
+    expected = len(rows) ** 2 / len(q) * (1 - ALIKE) / 2  # distributed at random, in random directions
     if pairs and pdtrc(pairs - 1, expected) >= RUN:
         member[:] = False
     return member
@@ -178,7 +178,7 @@ def coherent(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndar
     edges = np.flatnonzero(np.diff(suspect, prepend=False, append=False))
     long = np.zeros(len(suspect), dtype=bool)
     for start, end in edges.reshape(-1, 2):
-        # a run of so many begins at any visit with probability share^length: not once in a hundred sets of data
+        # such a run starts at a given visit with probability share^length: not once in a hundred sets of data
         if end - start >= NEIGHBOURS and len(suspect) * share ** (end - start) < RUN:
             long[start:end] = True
     return clustered(problem, x, rows) | long[visit[rows]]
@@ -219,8 +219,8 @@ def contradicted(
 ) -> np.ndarray:
     """Return which of some configurations (g,) are contradicted by the others.
 
-    A robust loss may fit half of few equations at the expense of the other half, of which none is wrong. So all the
-    possible outliers together are left out, and each is compared with what the rest predicts, by the false rate of
+    A robust loss may fit half of few equations at the expense of the other half, although none is wrong. So all
+    possible outliers are removed together, and each is compared with the prediction of the rest, at the false rate of
     flags; the penalty has its weight, and ``width`` (n,) are prior scales in units of the stated ones::
 
         e' (sigma^2 (I + A_i H^-1 A_i'))^-1 e,    H = A' A + weight L' L of the rest,    e = b_i - A_i z
@@ -243,7 +243,7 @@ def contradicted(
         e = A @ z - model.b[model.group == number]
         squares = float(e @ np.linalg.solve(np.eye(len(A)) + A @ C @ A.T, e)) / sigma2
         chance = chdtrc(len(A), squares)
-        if sigma2 > 1:  # it was estimated: Fisher's F
+        if sigma2 > 1:  # estimated: Fisher's F
             chance = fdtrc(len(A), spare, squares / len(A))
         decided = np.linalg.norm(A @ undecided) <= UNDECIDED * np.linalg.norm(A)
         outlying.append(bool(decided and chance < rare))

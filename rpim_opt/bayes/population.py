@@ -13,17 +13,17 @@ from rpim_opt.bayes.prior_terms import Result, default_widths, marginal
 from rpim_opt.convex.constraints import FAR
 from rpim_opt.problem.linear import reduced_rows
 
-PRIOR_ROBOTS = 3.0  # degrees of freedom of the hyperprior of the parameters' variances: as many robots it counts for
+PRIOR_ROBOTS = 3.0  # degrees of freedom of the hyperprior of the variances: the number of robots that it counts for
 PRIOR_RATIO, PRIOR_PARAMETERS = 1.0, 2.0
-"""Prior mean square of what robots share over that of what is their own; as many parameters it counts for."""
-ITERATIONS, SETTLED = 1000, 1e-6  # of expectation and maximization; relative change of the variances that ends them
+"""Prior ratio of common to individual mean squares, and the number of parameters that it counts for."""
+ITERATIONS, SETTLED = 1000, 1e-6  # of expectation and maximization; relative change of the variances at convergence
 
 
 def random_effects(arms: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
     """Return prior means and standard deviations (p,) for another robot by a random-effects model, in generic scales.
 
-    Of each robot are given rows (p, p) u - values (p,) ~ N(0, I). Deviations of robot k, in generic widths: what all
-    share, and what is its own::
+    Each robot is given by rows (p, p) u - values (p,) ~ N(0, I). A deviation of robot k, in generic scales, has a
+    common and an individual part::
 
         u_kj = m_j + d_kj,    d_kj ~ N(0, s_j^2),    m_j ~ N(0, rho s_j^2),    s_j^2 ~ scaled inverse chi^2 (3, tau^2)
 
@@ -52,7 +52,7 @@ def expectation(P: Array, q: Array, s2: Array, ratio: float) -> tuple[Array, Arr
     """Return mean (n,) and covariance (n, n) of the common effects, and mean squares (K, n) of the individual ones."""
     s = np.sqrt(s2)
     eye = np.eye(len(s2))
-    left = np.linalg.inv(eye + s[:, None] * P * s)  # in units of s: what the data leave open of a robot's own part
+    left = np.linalg.inv(eye + s[:, None] * P * s)  # in units of s: posterior covariance of a robot's individual part
     H = (eye - left) / np.outer(s, s)
     h = np.einsum("kij,kj->ki", left, s * q) / s
     C_m = np.linalg.inv(H.sum(axis=0) + np.diag(1 / (ratio * s2)))
@@ -67,8 +67,8 @@ def expectation(P: Array, q: Array, s2: Array, ratio: float) -> tuple[Array, Arr
 def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[str, float], dict[str, float]]:
     """Return prior means and standard deviations for another robot's parameters, by name with unit.
 
-    From the data of several robots of one type (`random_effects`), without the priors that they were calibrated with,
-    and with frames integrated out; arguments as for `Prior.from_population`.
+    They come from the data of several robots of one type (`random_effects`), without their calibrations' priors, and
+    with frames integrated out; arguments as for `Prior.from_population`.
     """
     if isinstance(results, Mapping):
         named = dict(results)

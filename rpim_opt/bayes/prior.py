@@ -18,12 +18,12 @@ from rpim_opt.robot.chain import ORIGIN
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session, overlay, own_name
 
-OFFSETS = "joint offsets"  # the group of what is set at assembly; what is machined are lengths and angles
+OFFSETS = "joint offsets"  # group of parameters set at assembly; lengths and angles are machined
 SESSIONS = {"length": "sessions' shifts", "angle": "sessions' turns"}  # groups of session offsets
 BASE = "base"
-"""The group of the base, which is registered with the nominal robot: as far off as its deviations lead.
+"""The group of the base: registered with the nominal robot, it is as far off as the robot's deviations cause.
 
-Tools and other frames are stated by hand or unknown: their scale is not estimated.
+Scales of tools and other frames, which are stated by hand or unknown, are not estimated.
 """
 _KIND = re.compile(r"(ecc2|ecc|[a-z]+)")
 _GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+|{ORIGIN}\w+_r?[xyz]")
@@ -33,23 +33,23 @@ _GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+|{ORIGIN}\w+_r?[xyz]")
 class Prior:
     """The prior of the deviations from nominal.
 
-    By default deviations have the scales of the parameters and Student's t, joint offsets three times those scales,
-    because they are set at assembly, and frames ten times. The data estimate a factor on them for each group: lengths,
-    angles and joint offsets, which are alike a priori, and the base. `stated` returns it for a problem in numbers.
+    By default deviations have Student's t with the parameters' scales, times three for joint offsets, which are set at
+    assembly, and times ten for frames. The data estimate a factor for each group: lengths, angles and joint offsets,
+    whose factors are similar a priori, and the base. `stated` returns the prior of a problem in numbers.
 
     ``centre`` are prior means of deviations by name, pattern or group with a unit as in `Parameters.scaled`,
-    ``{"theta5_mrad": 4.0}``, zero for all others; ``scale`` their prior standard deviations, ``{"theta?_mrad": 10.0,
-    "tool_mm": 2.0}``, which neither ``joint_offset`` nor ``frames``, the factors on the scales of joint offsets and of
-    frames (base, reflectors, anchors), nor the estimated scale of the base multiplies. ``tails`` are the degrees of
-    freedom of the Student's t of the robot's geometry; infinity: a normal distribution.
+    ``{"theta5_mrad": 4.0}``, zero by default; ``scale`` are prior standard deviations, ``{"theta?_mrad": 10.0,
+    "tool_mm": 2.0}``, which are final: no factor for joint offsets or frames and no estimated scale of the base
+    multiplies them. ``joint_offset`` and ``frames`` are those factors, the latter for base, reflectors and anchors.
+    ``tails`` are the degrees of freedom of Student's t for the robot's geometry; infinity means a normal distribution.
 
-    ``groups`` of parameters of the robot share an estimated scale of their own, as patterns: ``(("a?", "d?"),
-    ("alpha?",))``. Of the others, lengths and angles, a URDF's origins included, joint offsets and every model
-    extension share one each; session offsets have one for shifts and one for turns.
+    ``groups`` are patterns of robot parameters that share an estimated scale of their own: ``(("a?", "d?"),
+    ("alpha?",))``. Of the others, lengths, angles (both with a URDF's origins), joint offsets and every model extension
+    share one each; session offsets have one for shifts and one for rotations.
 
-    ``statements`` are of linear combinations (`known`, `from_result`). ``optional`` are the keys of centre and scale
-    (`from_population`) that are left out where the marginal likelihood is against them. InputError for tails, factors
-    or patterns that cannot be.
+    ``statements`` are about linear combinations (`known`, `from_result`). ``optional`` are keys of centre and scale
+    (`from_population`) that are dropped if the marginal likelihood is against them. InputError for invalid tails,
+    factors or patterns.
 
     >>> import rpim_opt as ro
     >>> Prior = ro.bayes.Prior
@@ -87,12 +87,12 @@ class Prior:
     def known(cls, text: str) -> Prior:
         """Return the prior with a known linear combination of parameters added.
 
-        ``"a2 + a3 = 612.3 +- 0.05 mm"`` is one of the parameters' values, ``"a2 + a3 +- 0.05 mm"`` is nominal to that
-        standard deviation, ``"a2 + a3 = nominal + 0.2 +- 0.05 mm"`` one of deviations. Where prior scales and noise are
-        estimated, the default, its standard deviation is absolute; with one weight, given or of a rule, the weight and
-        the estimated noise multiply the statement as they do all of the prior. InputError for any other text.
+        ``"a2 + a3 = 612.3 +- 0.05 mm"`` states the parameters' values, ``"a2 + a3 +- 0.05 mm"`` that they are nominal,
+        and ``"a2 + a3 = nominal + 0.2 +- 0.05 mm"`` their deviation. If prior scales and noise are estimated (the
+        default), the standard deviation is absolute; with one weight, given or chosen by a rule, the weight and the
+        estimated noise multiply it like the rest of the prior. InputError for any other text.
         """
-        from rpim_opt.convex.constraint_parser import combination  # texts are read where there are any
+        from rpim_opt.convex.constraint_parser import combination  # texts are parsed only if there are any
 
         stated = combination(text)
         (combined,) = stated.sums
@@ -108,14 +108,14 @@ class Prior:
     ) -> Prior:
         """Return the posterior of an earlier calibration as a prior, replacing the scales of its parameters.
 
-        Where the model is linear, calibrating with it at weight 1 equals calibrating with the data of both. It holds
-        the earlier penalty already: of several results of one robot only the last one is to be taken. With estimated
-        hyperparameters it is as wide as `Calibration.covariance`.
+        For a linear model, calibrating with it at weight 1 equals calibrating with both sets of data. It includes the
+        earlier penalty: of several results of one robot use only the last. With estimated hyperparameters its
+        covariance is `Calibration.covariance`.
 
-        ``inflate`` multiplies its standard deviations, above 1 where the robot may have changed; the prior is marginal
-        to parameters that match ``without``, patterns of what was set up anew; ``noise`` is the standard deviation of
-        its equations in units of the declared noise, by default what it found. InputError for a penalty without
-        covariance (lasso), and for factors that are not above zero.
+        ``inflate`` multiplies its standard deviations, above 1 if the robot may have changed; parameters that match
+        ``without``, patterns of replaced parts, are marginalized out; ``noise`` is the standard deviation of its
+        equations in units of the declared noise, by default the estimated one. InputError for a penalty without
+        covariance (lasso), and for factors that are not positive.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -132,9 +132,9 @@ class Prior:
     def from_population(cls, results: Sequence[Result] | Mapping[str, Result]) -> Prior:
         """Return a prior for another robot of a type from several calibrated ones: mean and standard deviation.
 
-        By empirical Bayes (`random_effects`), shrunken towards the generic scales where robots or data are few. Where
-        the marginal likelihood of another robot's data is against it, this prior is left out (``optional``). Names in
-        a mapping are those of messages. InputError for fewer than two, and for other nominal parameters.
+        It is shrunken towards the generic scales if robots or data are few (empirical Bayes, `random_effects`), and
+        dropped if the marginal likelihood of the other robot's data is against it (``optional``). Names in a mapping
+        appear in messages. InputError for fewer than two results, and for different nominal parameters.
         """
         from rpim_opt.bayes.population import population
 
@@ -144,7 +144,7 @@ class Prior:
     def where_known(self, stated: Parameters, found: Parameters) -> Parameters:
         """Return the located parameters, with known frames and known parameters at their stated values.
 
-        Of an orientation, and of frames with a scale of their own that is no wider than that of the table, too.
+        This holds for orientations, and for frames whose stated scale is not wider than that of the table.
         """
         own = overlay(stated, np.full(len(stated), np.nan), self.scale, "prior, table scale")
         known = {name for each in self.statements if not each.whole for name in each.names}
@@ -188,9 +188,9 @@ class Prior:
     def stated(self, parameters: Parameters, *, widened: bool = True) -> ScaledPrior:
         """Return the prior of the identified parameters of a whole table, in units of their scales.
 
-        Unless ``widened``, ``joint_offset`` and ``frames`` do not count: a penalty over the scales then stays what it
-        is where nothing is stated. InputError for names or patterns that the table has not, units that do not fit,
-        statements on values far from nominal.
+        Unless ``widened``, ``joint_offset`` and ``frames`` are ignored, so that a penalty over the scales does not
+        change without statements. InputError for unknown names or patterns, units that do not fit, and statements on
+        values far from nominal.
         """
         free = parameters.free
         identified = parameters.identified

@@ -19,8 +19,8 @@ from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.robot.parameters import Parameters, is_joint_offset
 
-FIXED = -1  # the group of a parameter whose prior scale is not estimated: of frames, but for the base, and of curves
-JOINT_OFFSET, FRAMES = 3.0, 10.0  # factors on the scales of joint offsets, which are set at assembly, and of frames
+FIXED = -1  # group of parameters whose prior scale is not estimated: frames except the base, and curves
+JOINT_OFFSET, FRAMES = 3.0, 10.0  # factors on the scales of joint offsets and frames
 
 
 def default_widths(parameters: Parameters, joint_offset: float = JOINT_OFFSET, frames: float = FRAMES) -> Array:
@@ -35,14 +35,14 @@ def default_widths(parameters: Parameters, joint_offset: float = JOINT_OFFSET, f
 class ScaledPrior:
     """Prior of the n identified parameters of a problem, in units of their scales.
 
-    Independently of each other, with an estimated scale tau_g a group, unless a statement replaces it::
+    Parameters are independent, with an estimated scale tau_g per group, unless a statement replaces their prior::
 
         z_j ~ centre_j + tau_g scale_j t_nu     (heavy)        z_j ~ N(centre_j, (tau_g scale_j)^2)     (others)
 
     (tau is 1 without a group), and together rows z - values ~ N(0, I), rows (k, n) and values (k,) of the statements.
-    Prior means ``centre`` (n,) and standard deviations ``scale`` (n,) are times ``parameters.scale``, ``parameters``
-    the identified ones. ``replaced`` (n,) are those with a statement in the place of a prior of their own, ``heavy``
-    (n,) those with Student's t of ``tails`` degrees of freedom; ``names[group]`` (n,) are the groups, -1 is none.
+    ``parameters`` are the identified ones; prior means ``centre`` (n,) and standard deviations ``scale`` (n,) are in
+    units of their scales. ``replaced`` (n,) have a statement in place of an own prior, ``heavy`` (n,) Student's t with
+    ``tails`` degrees of freedom; ``names[group]`` (n,) are the groups, -1 is none.
 
     >>> import rpim_opt as ro
     >>> parameters = ro.load("position").problem.parameters
@@ -77,7 +77,7 @@ class ScaledPrior:
     def penalized(self, formulation: Formulation) -> Formulation:
         """Return the formulation with the prior's penalty; the formulation itself if no prior is stated.
 
-        The penalty becomes, with zero in the place of what the statements replace::
+        With zero in place of parameters whose prior statements replace, the penalty is::
 
             penalty((z - centre) / scale) + |rows z - values|^2
 
@@ -102,9 +102,9 @@ class ScaledPrior:
 def prior_penalty(
     penalty: Callable[[Any], Any] | None, keep: Any, centre: Any, rows: Any, values: Any, groups: Any
 ) -> Callable[[Any], Any]:
-    """Return penalty(keep (z - centre)) + |rows z - values|^2; of norms |D_k keep (z - centre)| with groups D_k.
+    """Return penalty(keep (z - centre)) + |rows z - values|^2; with groups D_k of norms |D_k keep (z - centre)|.
 
-    ``keep`` is 1 / scale, and zero for what the statements replace.
+    ``keep`` is 1 / scale, and zero for parameters whose prior statements replace.
     """
     penalty = named(penalty)
     if groups is not None:
@@ -123,7 +123,7 @@ def _penalized(
         y = cp.multiply(np.array(keep), z - np.array(centre))
         if groups is None:
             terms.append(penalty(y))
-        elif penalty == SQUARES:  # of norms: the sum of all squares, and no cone
+        elif penalty == SQUARES:  # of norms: the sum of all squares, without a cone
             terms.append(cp.sum_squares(np.vstack([np.array(D) for D in groups]) @ y))
         else:
             which = np.repeat(np.arange(len(groups)), [len(D) for D in groups])
@@ -163,9 +163,9 @@ class _Penalty(Ready):
 class Statement:
     """Rows (v - reference) ~ N(values, I), where v are values of parameters; without a reference, their deviations.
 
-    Of p parameters, ``names`` and ``dimensions``: rows (k, p) [1 / SI] and values (k,), whitened, reference (p,) [SI].
-    A ``whole`` one stands in the place of the parameters' own scales, and is marginal where some of them are not
-    identified; otherwise those are nominal. ``text`` is as a person wrote it.
+    For p parameters with ``names`` and ``dimensions``: whitened rows (k, p) [1 / SI] and values (k,), reference (p,)
+    [SI]. A ``whole`` statement replaces the parameters' own priors, and is marginalized if some of them are not
+    identified; otherwise those are nominal. ``text`` is as written by a user.
     """
 
     names: tuple[str, ...]
@@ -184,8 +184,8 @@ class Statement:
     def on(self, parameters: Parameters) -> tuple[Array, Array, np.ndarray]:
         """Return rows (k, n) and values (k,) in units of the scales of the n identified parameters of a whole table.
 
-        And (n,) for which of them they stand in the place of their own scales. InputError for a name that the table has
-        not, another dimension, a value far from nominal.
+        The third result (n,) marks parameters whose own prior it replaces. InputError for an unknown name, another
+        dimension, and a value far from nominal.
         """
         here = {name: i for i, name in enumerate(parameters.names)}
         missing = [name for name in self.names if name not in here]
@@ -197,7 +197,7 @@ class Statement:
                 raise InputError(self.where, f"a unit of {dimension} for '{name}'", f"one of {of}")
         place = np.array([here[name] for name in known], dtype=int)
         own = np.array([self.names.index(name) for name in known], dtype=int)
-        offset = np.zeros(len(place))  # by how much nominal values [SI] differ from the reference
+        offset = np.zeros(len(place))  # nominal values [SI] minus the reference
         if self.reference is not None:
             offset = parameters.nominal[place] - np.array(self.reference)[own]
             self._require_near(parameters, place, own, offset)
@@ -223,7 +223,7 @@ class Statement:
         if self.whole:
             some = parameters.take(place)
             turned = np.flatnonzero(some.of_frames & some.periodic & (offset != 0))
-            if len(turned):  # angles of frames do not add up
+            if len(turned):  # angles of frames are not additive
                 found = f"'{some.names[turned[0]]}' relative to another nominal orientation"
                 accepted = "the frame's earlier nominal values; or no prior on a frame that was re-registered"
                 raise InputError(self.where, found, accepted)
@@ -240,7 +240,7 @@ class Statement:
 def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array]:
     """Return rows (k', p') and values (k',) of a statement marginalized to a subset of its parameters.
 
-    Projected off the columns of the others.
+    The columns of the others are projected out.
     """
     if len(kept) == rows.shape[1] and (kept == np.arange(len(kept))).all():
         return rows, values
@@ -263,7 +263,7 @@ def nested(matrix: Array) -> tuple[tuple[float, ...], ...]:
 
 
 Result = Any
-"""A `Calibration`, which is defined above this folder."""
+"""A `Calibration`, defined in a later folder."""
 
 
 def posterior(result: Result, inflate: float, without: Sequence[str], noise: float | None) -> Statement:

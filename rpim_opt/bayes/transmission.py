@@ -1,7 +1,7 @@
 """Transmission errors of joints: a model extension with a Gaussian process of each joint's angle.
 
-f(q) = sum_k c_k cos(w_k q) + s_k sin(w_k q) stands for two processes with Matern covariance (3/2), ripple and waves,
-where coefficients have the variances of `Spectrum`; w_k are multiples of 2 pi / period, and of 1 below these.
+f(q) = sum_k c_k cos(w_k q) + s_k sin(w_k q) represents two processes with Matern covariance (3/2), ripple and waves.
+Coefficients have the variances of `Spectrum`; w_k are multiples of 2 pi / period, and below these of 1.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from rpim_opt.bayes.prior_terms import FIXED
 from rpim_opt.problem.noise import Repeatability, Stack
 from rpim_opt.robot.terms import Curve
 
-TRANSMISSION = "transmission error"  # the extension by curves of the joints' transmission error
-GAIN = 12.0  # fall of -2 ln L for curves: real arms without them gain up to 10, of 162 simulated ones none 12
+TRANSMISSION = "transmission error"  # the extension by curves of the joints
+GAIN = 12.0  # fall of -2 ln L required of curves: real arms without them gain up to 10, of 162 simulated ones none 12
 MOMENTS_GAIN = 20.0
-"""By how much it must fall for first moments of links beside curves: admitted at a gain of 15 they made errors outside
-the measured range 1.44 times as large; with all data of that arm they gain 70, and are needed."""
+"""The same for first moments of links with curves: admitted at a gain of 15 they made errors outside the measured range
+1.44 times as large; with all data of that arm they gain 70, and are needed."""
 COLUMNS, FINEST = 68, 128
-"""Harmonics a joint in the mean at most, sines and cosines, of six joints at least; cycles a turn of the finest one."""
-SHORTEST = 0.05  # travel of a joint [rad] from which its curve is looked for
-BEYOND = 0.3  # how far curves go on beyond the measured angles [rad], where they are unknown
-STARTS = (0.3, 0.03)  # length scales [rad] from which the optimum is looked for
-ACCURACY = 0.3  # slope of -2 ln L by the logarithms of hyperparameters at which curves are admitted
-LEAST = 2e-6  # noise [m or rad] from which its optimum is looked for at least
+"""Mean number of harmonics (sine and cosine) per joint, for at least six joints; cycles per turn of the finest one."""
+SHORTEST = 0.05  # travel of a joint [rad] from which its curve is sought
+BEYOND = 0.3  # continuation of curves beyond the measured angles [rad], where they are unknown
+STARTS = (0.3, 0.03)  # length scales [rad] at which the search for the optimum starts
+ACCURACY = 0.3  # derivative of -2 ln L by ln(hyperparameters) at which curves are admitted
+LEAST = 2e-6  # least noise [m or rad] at which the search for its optimum starts
 
 
 def series(curves: Sequence[Curve], q: Array, slopes: Array) -> Array:
@@ -53,12 +53,11 @@ def admitted(
 ) -> tuple[Fit, tuple[Trial, ...], float] | None:
     """Return the fit with transmission errors, the models compared, and the decrease of -2 ln L; None if too small.
 
-    And where an equation depends on several configurations, or on one of several robots, and where curves correlate
-    over more than the joints turned: then they are joint zeros that were not to be identified.
-    Curves stand in the place of second harmonics. All other extensions are selected again, with curves in the model;
-    gravity stays if it was selected without them: waves can imitate it where joints were measured, but not elsewhere.
-    ``fit`` is that of the model without curves that was selected, the first of ``trials``; ``stated`` are the names of
-    the parameters that were to be identified.
+    None also if an equation depends on several configurations or on one of several robots, and if curves correlate over
+    more than the joints' travel: then they are joint zeros that were not to be identified. Curves replace second
+    harmonics. All other extensions are selected again with curves in the model; gravity stays if it was selected
+    without them: waves can imitate it in the measured range, but not elsewhere. ``fit`` is that of the selected model
+    without curves, the first of ``trials``; ``stated`` are the names of the parameters to identify.
     """
     several = any(block.q.shape[1] > 1 for block in fit.problem.data.blocks)
     if several or len(fit.problem.arms) > 1 or fit.problem.touches is not None:

@@ -25,9 +25,9 @@ from rpim_opt.problem.problem import CalibrationProblem, RobotModel
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, frame_of, of_session, session_prefix
 
-ROWS = 4096  # rows that are evaluated, weighed and reduced together
-KEPT = 200_000  # equations up to which a calibration keeps its rows, wherever they stand; beyond, only their QR factor
-Part = Callable[[], Dataset]  # reads some of the measurements; whole configurations
+ROWS = 4096  # rows that are evaluated, whitened and reduced together
+KEPT = 200_000  # largest number of equations that a calibration keeps; of more, only their QR factor
+Part = Callable[[], Dataset]  # reads a block of the measurements: whole configurations
 Numbered = tuple[int, Part]
 
 
@@ -35,8 +35,8 @@ Numbered = tuple[int, Part]
 def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
     """Return the model of ``problem.linearize(x)`` as its QR factor: n + 1 equations, the same |A z - b| for every z.
 
-    Rows are evaluated, whitened and reduced `ROWS` at a time, whole configurations, so that memory does not grow with
-    their number.
+    Rows are evaluated, whitened and reduced in groups of whole configurations, about `ROWS` at a time, so that memory
+    does not grow with their number.
     """
     groups = whole_configurations(problem.data, ROWS) if len(problem.data) else ()
     return reduced_models(problem.on(problem.data.take(rows)).linearize(x, reweigh) for rows in groups)
@@ -46,21 +46,21 @@ def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = Non
 class PartitionedProblem(RobotModel):
     """A calibration problem whose measurements come in blocks, read again at every iteration.
 
-    Every block is reduced to a QR factor (n+1, n+1), and these to one; so that memory depends on the largest block and
-    not on their number, and blocks may be read by threads or by the workers of a cluster. What needs rows goes through
-    `rows`, one block after the other; a row's label is preceded by the number of its block, ``2:T8-6``.
+    Every block is reduced to a QR factor (n+1, n+1), and these to one, so that memory depends on the largest block and
+    not on their number, and blocks may be read by threads or by the workers of a cluster. Rows, where needed, are read
+    through `rows`, block by block; a row's label has the number of its block as prefix, ``2:T8-6``.
 
-    ``robots`` and ``parameters`` are as `CalibrationProblem` has them; ``first`` is the first block, or what resembles
-    it: it finds the frames' start, and is checked as a problem's data are. ``parts`` are functions that read the
+    ``robots`` and ``parameters`` are those of `CalibrationProblem`; ``first`` is the first block, or similar data: the
+    frames' start values come from it, and it is checked like a problem's data. ``parts`` are functions that read the
     blocks, at least one (`partitions` makes them from files), ``dropped`` the labels of rows that are left out.
 
     ``compute`` is like the built-in ``map``, in any order of execution: ``ThreadPoolExecutor().map``, or with a client
     of a Dask cluster ``lambda task, parts: client.gather(client.map(task, list(parts), pure=False))``. By default files
-    of `partitions` are read and reduced on all cores, while functions of a script are called one after the other. Each
-    block has one QR factor, so that no digit depends on who computed it.
+    of `partitions` are read and reduced on all cores, and a script's functions are called one after the other. Each
+    block has its own QR factor, so that the result is the same to the last digit whoever computes it.
 
-    InputError for no blocks, as `CalibrationProblem`, and for `data` of all the blocks, which do not stand anywhere;
-    when a block is read whose sessions the parameters do not have, where they have others (`starting_parameters`).
+    InputError for no blocks, as for `CalibrationProblem`, for access to `data` of all blocks (they are not in memory),
+    and while reading, for a block whose sessions the parameters lack (`starting_parameters`).
 
     >>> import rpim_opt as ro
     >>> whole = ro.load("position").problem
@@ -140,7 +140,7 @@ class PartitionedProblem(RobotModel):
         """Return the linear model of all blocks around the deviations x (n,) [SI], as a QR factor.
 
         Arguments as for `CalibrationProblem.linearize`; ``reweigh`` gets some thousand rows at a time, whole
-        configurations, where a block is read.
+        configurations, where the block is read.
         """
         return reduced_models(self._everywhere(partial(reduced, x=x, reweigh=reweigh)))
 
@@ -160,7 +160,7 @@ class PartitionedProblem(RobotModel):
 
     def _everywhere(self, what: Callable[[CalibrationProblem], Any]) -> list[Any]:
         """Return what a function makes of every block, read and evaluated where ``compute`` does so."""
-        known = self.on(self.first.take([0]))  # one row: what a worker must know besides its own block
+        known = self.on(self.first.take([0]))  # one row: what a worker needs to know besides its own block
         task = partial(_on_part, what, known, self.dropped)
         results = (self.compute or map)(task, list(enumerate(self.parts, start=1)))
         answers = [result for result in results if result is not None]
@@ -170,7 +170,7 @@ class PartitionedProblem(RobotModel):
 
 
 Source = CalibrationProblem | PartitionedProblem
-"""What a calibration needs of its measurements, in memory or in blocks: linear models, and rows block by block."""
+"""Measurements of a calibration, in memory or in blocks: linear models, and rows block by block."""
 
 
 def in_parts(problem: Source) -> Source:
@@ -213,10 +213,10 @@ def _read(parameters: Parameters, dropped: frozenset[str], part: Numbered) -> Da
 def partitions(
     paths: Sequence[str | Path], robot: Robot, noise: Mapping[str, Any], measurement: Measurement = position
 ) -> tuple[Part, ...]:
-    """Return functions that read the files, each a table as `read_data` takes it, of a few hundred thousand rows.
+    """Return functions that read the files, each a table for `read_data` with at most some hundred thousand rows.
 
-    A configuration's rows stand in one file. Parquet is read fastest. Other arguments as for `read_data`; InputError
-    for no paths, and when a part is read.
+    All rows of a configuration must be in one file. Parquet is read fastest. Other arguments as for `read_data`;
+    InputError for no paths, and when a part is read.
 
     >>> import rpim_opt as ro
     >>> robot = ro.load("paper_arm").problem.robot

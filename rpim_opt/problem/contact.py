@@ -27,16 +27,16 @@ class Moved(NamedTuple):
 class Feature:
     """The point or plane of best fit to the positions p_i (K, 3) of its touches.
 
-    A touch of a point shows where it is, p_i; of a plane how far it is along the normal n, s_i = n'(p_i - centre), its
-    first coordinate here, while two others are zero. Without the thing K touches say of the robot alone what is left of
-    these in an orthonormal basis (K, k) of what is perpendicular to the ``places``: for a point to 1 (Helmert's
-    contrasts, of every touch to the mean of those before it), for a plane to 1, u, v, the coordinates in the plane.
-    Independent touches of one accuracy have independent contrasts of that accuracy.
+    A touch of a point observes its position p_i; one of a plane the coordinate s_i = n'(p_i - centre) along the normal
+    n, the first coordinate here, with the two others zero. With the unknown point or plane eliminated, K touches
+    constrain the robot only by these coordinates projected on an orthonormal basis (K, k) perpendicular to the
+    ``places``: for a point to 1 (Helmert's contrasts: every touch minus the mean of the previous ones), for a plane to
+    1, u, v, the coordinates in the plane. Contrasts keep the touches' independence and accuracy.
 
-    ``centre`` and ``normal`` are (3,) each, ``across`` (2, 3) two directions in the plane: the projection of the
-    coordinate axis number ``axis`` (None for a plane that is parallel to those that should be), and what is
-    perpendicular to that; zero for a point. ``height`` (K,) is s of every touch [m], ``places`` (K, 1 or 3) 1, u, v
-    [m], ``shown`` (3 or 1, 3) the directions that a touch shows.
+    ``centre`` and ``normal`` are (3,) each; ``across`` (2, 3) are two directions in the plane, the projection of the
+    coordinate axis number ``axis`` (None for a plane that should be parallel to others) and the one perpendicular to
+    it, zero for a point. ``height`` (K,) is s of every touch [m], ``places`` (K, 1 or 3) are 1, u, v [m], ``shown`` (3
+    or 1, 3) the directions that a touch observes.
     """
 
     centre: Array
@@ -101,7 +101,7 @@ class Feature:
     def moved(self, values: Array) -> Moved:
         """Return the change of the point or plane for changes (K, 3, c) of its touches.
 
-        n is the eigenvector of M = sum_i q_i q_i', q_i = p_i - centre, with the least eigenvalue s's::
+        n is the eigenvector to the smallest eigenvalue s's of M = sum_i q_i q_i', q_i = p_i - centre::
 
             dn = -E' (E M E' - s's)^-1 E dM n,    dM n = sum_i q_i n'dp_i + s_i dp_i,    E the directions in the plane
         """
@@ -124,7 +124,7 @@ class Feature:
         return Moved(centre, normal, across)
 
 
-CLOSE = 0.05  # touches that spread by less [m] do not show how large a robot is, whatever else is known
+CLOSE = 0.05  # touches that spread by less [m] do not determine the size of a robot, whatever else is known
 Features = Sequence[Feature]
 
 
@@ -142,15 +142,15 @@ class Touches:
     """Assignment of equations to touched points and planes, and their elimination.
 
     Touches at p_i have the equations c - p_i ~ 0 with an unknown point c, or n'(p_i - c) ~ 0 with a plane.
-    Their best values follow from the touches (`Feature`), and what the equations say of the robot alone are contrasts,
-    which do not depend on them: c is a fixed effect, exactly. A known dimension between two of them is an equation of
-    these best values: d - |c_2 - c_1| for points, d - |n_1'(c_2 - c_1)| for planes, 0 - asin n_1'n_2 for square ones,
-    n_2 along two directions in the first for parallel ones.
+    Their best values follow from the touches (`Feature`); the equations constrain the robot only by contrasts, which do
+    not depend on them: c is a fixed effect, exactly. A known dimension between two of them is an equation of these best
+    values: d - |c_2 - c_1| for points, d - |n_1'(c_2 - c_1)| for planes, 0 - asin n_1'n_2 for perpendicular planes, n_2
+    along two directions in the first for parallel ones.
 
     ``names`` are those of the points and planes, ``rows`` the numbers (K, 3) of the equations of the touches of each,
-    ``planar`` which of these are planes, ``ties`` what is known of two of them, ``equations`` how many there are before
-    the elimination. ``where`` are the points and planes that contrasts are taken of, located by the nominal robot, and
-    ``spread`` is the RMS distance of its touches from their mean [m].
+    ``planar`` states which are planes, ``ties`` are known relations of two of them, ``equations`` is the number of
+    equations before the elimination. ``where`` are the points and planes located by the nominal robot, which define the
+    contrasts, ``spread`` is the RMS distance [m] of the touches of each from their mean.
     """
 
     names: tuple[str, ...]
@@ -200,9 +200,9 @@ class Touches:
     def centred(self, residual: Array, jacobian: Array) -> tuple[Array, Array]:
         """Return residual (m,) and Jacobian (m, n) about the points and planes of best fit.
 
-        A robot that shrinks to nothing would touch everything at once. What touches leave is therefore counted in
-        units of their spread, times the nominal robot's: they do not determine the size of the robot. Touches that
-        spread by less than `CLOSE` count as they are.
+        A robot that shrinks to a point touches everything at once. The remaining equations are therefore divided by the
+        touches' spread and multiplied by the nominal robot's: they do not determine the size of the robot. Touches that
+        spread by less than `CLOSE` are not scaled.
         """
         where = self.located(residual)
         spread = self.size(residual)
@@ -286,7 +286,7 @@ def contrasted(touches: Touches, stacks: Sequence[Stack], stop: np.ndarray) -> l
     place = np.cumsum(mask) - 1
     own = np.ones(touches.equations, dtype=bool)
     for tie in touches.ties:
-        own[tie.equations] = False  # its touches vary, and not what is stated
+        own[tie.equations] = False  # its touches vary, not the statement
     by_size: dict[tuple[int, ...], list[tuple[Array, ...]]] = {}
     for stack in stacks:
         for n, index in enumerate(stack.index):
@@ -299,7 +299,7 @@ def contrasted(touches: Touches, stacks: Sequence[Stack], stop: np.ndarray) -> l
             joint = np.zeros((len(index), stops.max() + 1, stack.joint.shape[2]))
             joint[np.arange(len(index)), stops] = stack.joint[n] * own[index, None]
             joint = W @ joint.reshape(len(index), -1)
-            if joint.shape[1] > len(joint):  # as many columns as equations have the same J J'
+            if joint.shape[1] > len(joint):  # as many columns as equations suffice for the same J J'
                 joint = np.asarray(np.linalg.qr(joint.T, mode="r")).T
             dimensions = (each[n][kept] & own[rows] for each in (stack.length, stack.angle))
             unit = (W * (stack.length[n] & own[index])) @ W.T
@@ -319,10 +319,10 @@ def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], reading: boo
     for thing, index in zip(touches.where, touches.rows, strict=True):
         V = touch[index[:, 0]]
         K = len(V)
-        if K > 1:  # what touches are off the thing that they put in its place, of their own
+        if K > 1:  # errors of the touches about their own point or plane
             through = thing.slopes(np.eye(3 * K).reshape(K, 3, 3 * K)).reshape(K, 3, K, 3)
             own = np.einsum("aibj,bjk,albk->ail", through, V, through)
-            # directions that a touch does not show have no error: any positive variance serves
+            # directions that a touch does not observe have no error: any positive variance does
             diagonal = np.einsum("kii->ki", own)
             diagonal += np.where(diagonal > 0, 0.0, V.max())
             left[index[:, 0]] = own

@@ -20,18 +20,18 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
 
 CRITERIA = {"D": "det^(1/n)", "A": "mean variance", "V": "predicted variance"}
-ANYWHERE = 1.0  # standard deviation of where a touched point is [m]
-MOST_STEPS, MOST_PASSES = 4000, 20  # of the relaxation, and of exchanges over all chosen
+ANYWHERE = 1.0  # standard deviation of the unknown position of a touched point [m]
+MOST_STEPS, MOST_PASSES = 4000, 20  # of the relaxation; exchange passes over all chosen configurations
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Design(Brief):
     """A chosen set of configurations.
 
-    ``chosen`` (count,) are indices of the candidates, ``weights`` (M,) what the relaxation gives every candidate, from
-    0 to 1. ``value`` is the ``criterion`` D, A or V of the chosen set (ln det M for D, [m^2] for V), ``bound`` what no
-    set of that size can exceed (fall below, for A and V), and ``gap`` bound over value as efficiencies, minus 1: 0.01
-    means that no set is more than 1 % better. D counts per parameter, det^(1/n).
+    ``chosen`` (count,) are indices of the candidates, ``weights`` (M,) their weights in the relaxation, from 0 to 1.
+    ``value`` is the ``criterion`` D, A or V of the chosen set (ln det M for D, [m^2] for V), ``bound`` a bound that no
+    set of that size exceeds (for A and V: falls below), and ``gap`` the ratio of their efficiencies minus 1: 0.01 means
+    that no set is more than 1 % better. D counts per parameter, det^(1/n).
     """
 
     chosen: np.ndarray
@@ -53,10 +53,10 @@ class Design(Brief):
 
 
 def random_candidates(robot: Robot, count: int, seed: int | np.random.Generator = 0, share: float = 1.0) -> Array:
-    """Return joint values (count, dof) [rad or m], uniform in the middle of every joint's range.
+    """Return joint values (count, dof) [rad or m], uniform in the middle part of every joint's range.
 
-    ``seed`` is that of the draws, or a generator to draw from; ``share`` which part of every joint's range is used,
-    from 0 to 1. InputError for a joint without limits.
+    ``seed`` is a seed or a generator; ``share`` is the used part of every joint's range, from 0 to 1. InputError for a
+    joint without limits.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -93,22 +93,22 @@ def choose(
 ) -> Design:
     """Choose the configurations that are most informative about the identified parameters.
 
-    With rows A_i of the whitened, scaled Jacobian at nominal and the prior of the scales, the information of a set is
-    M = 1 + sum A_i' A_i. Relaxed to weights 0 <= w_i <= 1 with sum w_i = count, each criterion is convex::
+    With rows A_i of the whitened, scaled Jacobian at nominal and the prior of the scales, the information of a set is M
+    = 1 + sum A_i' A_i. Relaxed to weights 0 <= w_i <= 1 with sum w_i = count, each criterion is convex::
 
         D   maximize ln det M
         A   minimize tr M^-1
-        V   minimize the mean variance of the candidates' positions, the axes' sum [m^2]
+            V   minimize the mean variance of the candidates' positions, summed over the axes [m^2]
 
-    Of a problem whose rows touch points, the candidates are configurations at one point (`configurations_at`); V counts
-    positions of the tool.
+    If the problem's rows touch points, the candidates are configurations at one point (`configurations_at`), and V
+    refers to positions of the tool.
 
-    The relaxation is solved by multiplicative steps (Silvey, Titterington and Torsney 1978), whose slopes bound what
-    any set can reach. The largest weights are rounded and improved by exchanges (Fedorov 1972).
+    The relaxation is solved by multiplicative steps (Silvey, Titterington and Torsney 1978), whose gradients bound all
+    sets. The largest weights are rounded, and the set is improved by exchanges (Fedorov 1972).
 
-    The first block of the problem's data defines what is measured. ``candidates`` (M, dof) are joint values of the
-    controller that could be measured, ``measured`` a `Dataset` of rows that are there already, which M then counts,
-    too. InputError for another criterion, a count that the candidates do not allow, or measurements between two points.
+    The first block of the problem's data defines what is measured. ``candidates`` (M, dof) are possible joint values of
+    the controller; ``measured`` is a `Dataset` of existing rows, which M then includes. InputError for another
+    criterion, a count that the candidates do not allow, or measurements between two points.
 
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
@@ -122,7 +122,7 @@ def choose(
         raise InputError("count", f"{count}", f"1 to {len(candidates) - 1}, fewer than the candidates")
     A = _rows(problem, candidates)
     if problem.data.blocks[0].measurement.touching:
-        # touches of one point, a fixed effect: its place is unknown to `ANYWHERE`
+        # touches of one point, whose position is unknown to `ANYWHERE`: a fixed effect
         place = -ANYWHERE * np.linalg.inv(np.linalg.cholesky(np.median(problem.data.blocks[0].covariance, axis=0)))
         A = np.asarray(np.concatenate([A, np.broadcast_to(place, (len(A), 3, 3))], axis=2), dtype=float)
     n = A.shape[2]
@@ -131,7 +131,7 @@ def choose(
         P = _rows(problem, candidates, whitened=False)
         C = np.zeros((n, n))
         C[: P.shape[2], : P.shape[2]] = np.einsum("kin,kim->nm", P, P) / len(P)
-    prior = np.eye(n)  # with what is measured already
+    prior = np.eye(n)  # including existing measurements
     if measured is not None:
         if measured.blocks[0].measurement.touching:
             raise InputError("measured", "touches of points", "a measurement type with independent rows")
@@ -149,7 +149,7 @@ def _rows(problem: CalibrationProblem, q: Array, whitened: bool = True) -> Array
     """Jacobians (M, k, n) of the candidates at nominal, in units of the scales; of positions [m] if not whitened."""
     block = problem.data.blocks[0]
     kind = block.measurement
-    if kind.touching:  # where the tool is: the point's own columns stand for what a touch does not show
+    if kind.touching:  # the tool's position: the point's own columns have the directions that a touch does not observe
         kind = position
     if kind.points != 1:
         raise InputError("design", f"measurement '{kind.name}' between two points", "measurements of one point")
@@ -174,7 +174,7 @@ def _criterion(M: Array, criterion: str, C: Array) -> tuple[float, Array]:
 def _relaxed(A: Array, prior: Array, count: int, criterion: str, C: Array) -> tuple[Array, float]:
     """Maximize over {0 <= w <= 1, sum w = count} by multiplicative steps; weights and a bound on the optimum.
 
-    The criteria are concave, so that the slope at any weights bounds them all.
+    The criteria are concave, so that the gradient at any weights bounds them all.
     """
     n = A.shape[2]
     w = np.full(len(A), count / len(A))
@@ -192,7 +192,7 @@ def _relaxed(A: Array, prior: Array, count: int, criterion: str, C: Array) -> tu
         # min(1, mu v) with mu such that the sum is count
         v = w * np.maximum(gain, 1e-300) ** power
         order = np.argsort(-v)
-        mu = (count - np.arange(count)) / np.cumsum(v[order][::-1])[::-1][:count]  # if so many weights are 1
+        mu = (count - np.arange(count)) / np.cumsum(v[order][::-1])[::-1][:count]  # if that many weights are 1
         w = np.minimum(1.0, mu[np.argmax(mu * v[order[:count]] <= 1)] * v)
     return w, bound
 
@@ -222,20 +222,21 @@ def _exchanged(A: Array, prior: Array, chosen: np.ndarray, criterion: str, C: Ar
 
 
 TIE = 1e-6
-"""Sizes that differ by less than this part are the same but for rounding: the order of the parameters decides."""
+"""Relative difference of sizes that is rounding: the order of the parameters decides then."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Observability(Brief):
-    """How well a number of ``configurations`` shows the n identified parameters (``names``).
+    """Identifiability of the n identified parameters (``names``) in a number of ``configurations``.
 
-    ``singular_values`` (n,) are those of the whitened Jacobian in units of the scales: how many standard deviations of
-    the noise a deviation of one scale along that direction moves the data; zeros are unidentifiable directions, and
-    ``rank`` is the number of identifiable combinations. ``unidentifiable`` are parameters that no measurement depends
-    on. ``redundant`` are combinations, name to coefficient [mm, mrad], along which the parameters may change without
-    changing any measurement; the largest coefficient is 1. ``base`` are the base parameters, what the data determine,
-    each a sum, name to coefficient [mm, mrad]: the first name has coefficient 1, and the redundant parameters add to it
-    (QR with column pivoting). ``condition`` is the largest over the smallest singular value that is not zero.
+    ``singular_values`` (n,) are those of the whitened Jacobian in units of the scales: the change of the data, in
+    standard deviations of the noise, for a deviation of one scale along that direction. Zeros are unidentifiable
+    directions, and ``rank`` is the number of identifiable combinations. ``unidentifiable`` are parameters on which no
+    measurement depends. ``redundant`` are combinations, name to coefficient [mm, mrad], along which the parameters may
+    change without changing any measurement; their largest coefficient is 1. ``base`` are the base parameters that the
+    data determine, each a sum, name to coefficient [mm, mrad]: the first name has coefficient 1, the others are
+    redundant parameters that add to it (QR with column pivoting). ``condition`` is the largest over the smallest
+    nonzero singular value.
 
     >>> import rpim_opt as ro
     >>> found = ro.problem.observe(ro.load("rank_deficient").problem)
@@ -295,8 +296,8 @@ class Observability(Brief):
 def observe(problem: Source) -> Observability:
     """Return the observability of a problem's identified parameters, with data in memory or in blocks.
 
-    It is linearized at nominal, where redundancies are exact. Measured values do not matter, configurations, scales
-    and covariance do.
+    It is linearized at nominal, where redundancies are exact. It depends on configurations, scales and covariance, not
+    on measured values.
     """
     free = problem.parameters.free
     x = np.zeros(len(free))
@@ -305,7 +306,7 @@ def observe(problem: Source) -> Observability:
     A, rank = model.qr_factor[: len(x), : len(x)], model.rank
     length = np.linalg.norm(A, axis=0)
     blind = length <= 1e-10 * length.max()
-    # redundant columns are often parallel and of one length: the first counts as the longest, or rounding would choose
+    # redundant columns are often parallel and equally long: the first counts as the longest, independent of rounding
     pivot = scipy.linalg.qr(A * (1 - TIE * np.arange(len(x))), mode="r", pivoting=True)[1][:rank]
     # column rest[j] = sum_i W_ij column pivot[i]
     rest = np.setdiff1d(np.arange(len(x)), pivot)
@@ -316,7 +317,7 @@ def observe(problem: Source) -> Observability:
     nulls[:, pivot] = -W.T
     nulls[np.arange(len(rest)), rest] = 1.0
     nulls = nulls[~blind[rest]] * free.scale
-    # the first of the largest counts as one, or rounding would choose the sign of d6 - tool_z
+    # the first of the largest counts as one: rounding must not determine the sign of d6 - tool_z
     size = np.abs(nulls)
     largest = np.argmax(size >= (1 - TIE) * size.max(axis=1, keepdims=True), axis=1)
     nulls /= np.take_along_axis(nulls, largest[:, None], axis=1)

@@ -16,22 +16,21 @@ from rpim_opt.basics.text import Brief, counted
 from rpim_opt.robot.parameters import Parameters
 
 RANK_TOLERANCE = 1e-10
-"""Singular values below this part of the largest count as zero: the data do not see those directions."""
+"""Singular values below this part of the largest count as zero: unidentifiable directions."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearModel(Brief):
-    """A calibration linearized around some deviation: A z ~ b, everything dimensionless.
+    """A calibration linearized about a deviation z_k: A z ~ b, dimensionless.
 
-    A (m, n) = Sigma^-1/2 J S is the whitened identification Jacobian in units of the scales, and b (m,) =
-    Sigma^-1/2 r + A z_k, so that z is the *total* deviation in units of the scales. ``group`` (m,) is the number of the
-    configuration that an equation belongs to; ``parameters`` are the n identified ones.
+    A (m, n) = Sigma^-1/2 J S is the whitened identification Jacobian in units of the scales, and b (m,) = Sigma^-1/2 r
+    + A z_k, so that z is the *total* deviation in units of the scales. ``group`` (m,) are the numbers of the equations'
+    configurations; ``parameters`` are the n identified ones.
 
-    ``constrained`` is whether measured values are constraints (a plane, a sphere). A robot shrunk to nothing would
-    satisfy them, so that their residuals do not determine the noise. ``stands_for`` is how many equations A and b were
-    reduced from by a rotation, None where they are the equations themselves, and ``offset`` what a loss that these
-    equations stand for has besides |A z - b|^2. ``factor`` is what a loss multiplied the squares by, which are in units
-    of the noise with 1.
+    ``constrained`` states that measured values are constraints (a plane, a sphere): a robot shrunk to a point satisfies
+    them, so that their residuals do not determine the noise. ``stands_for`` is the number of equations that a rotation
+    reduced to A and b, None if they were not reduced; ``offset`` is the constant of the loss beside |A z - b|^2;
+    ``factor`` multiplies squares in units of the noise, 1 unless a loss sets it.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -99,12 +98,12 @@ def svd(A: Array) -> tuple[Array, Array, Array]:
     """Return U, s, V' of A (m, n), of min(m, n) singular values."""
     try:
         return np.linalg.svd(A, full_matrices=False)
-    except np.linalg.LinAlgError:  # as LAPACK's quicker driver ends with 514 parameters of 80 sessions
+    except np.linalg.LinAlgError:  # LAPACK's faster driver fails with 514 parameters of 80 sessions
         return scipy_svd(A, full_matrices=False, lapack_driver="gesvd")
 
 
 NARROW, WIDE, MANY = 8, 32, 100
-"""Columns that are reduced together where there are few, and from `MANY` on: as is quickest."""
+"""Columns that are reduced together if there are few, and if there are `MANY`: the fastest choice."""
 (GEQRT,) = get_lapack_funcs(("geqrt",), dtype=np.float64)
 
 
@@ -133,4 +132,4 @@ def reduced_models(models: Iterable[LinearModel]) -> LinearModel:
 
 
 Reweigh = Callable[[LinearModel, Array], tuple[LinearModel, float]]
-"""``reweigh(model, z)``: some equations whose squares, and a constant, stand at z (n,) for a loss of the model's."""
+"""``reweigh(model, z)`` returns equations whose squares, plus the returned constant, model the loss at z (n,)."""

@@ -22,10 +22,10 @@ from rpim_opt.problem.registration.frames import shared_bases
 from rpim_opt.robot.parameters import concatenated, frame_of, known_patterns, of_session, session_prefix
 
 NAME = re.compile(r"(?!tool$|base$)[A-Za-z]\w*")
-MOST_PARAMETERS = 2000  # parameters up to which sessions are identified
-MINUTES = 0.26  # time of a default calibration of a thousand parameters; of 274 it takes 0.5 s, of 514 3 s
+MOST_PARAMETERS = 2000  # largest number of parameters with which sessions are identified
+MINUTES = 0.26  # of a default calibration with a thousand parameters; 0.5 s with 274, 3 s with 514
 FAR = 3.0
-"""How many scales the nominal values of a shared parameter may differ by: as much as a frame's before it is moved."""
+"""Largest difference of a shared parameter's nominal values, in scales; a frame further off is registered again."""
 
 
 def together(
@@ -33,19 +33,19 @@ def together(
 ) -> CalibrationProblem:
     """Combine problems: two arms and one tracker, one robot in two campaigns, one tool on two robots.
 
-    A problem like any other: `calibrate` takes it with any formulation and selector, or learns its sizes, one for each
-    kind of parameter of all robots, and one repeatability. Parameters are called ``name.parameter``, ``left.a2``, but
-    those that are shared keep their name; configurations of different problems are never the same.
+    The result is a problem like any other: `calibrate` takes it with any formulation and selector, or estimates prior
+    scales, one per kind of parameter of all robots, and one repeatability. Parameters are named ``name.parameter``,
+    ``left.a2``, unless they are shared; configurations of different problems are never the same.
 
-    The problems are in memory, of one robot each; called ``A``, ``B``, ..., or by name: ``left=problem``. ``shared``
-    are patterns of the parameters that are one and the same in all problems that have them, ``["tool_*"]``; their
-    nominal values are those of the first of these. Or patterns by the names of problems, each with its own: of two arms
-    of one cell and a camera outside, the arms' ``base_*``. Joints of one URDF have parameters that can be shared
-    where chains branch, too, with ``read_urdf(..., origins=True)``.
+    The problems are in memory, of one robot each; their names are ``A``, ``B``, ..., or stated: ``left=problem``.
+    ``shared`` are patterns of parameters that are the same in all problems that have them, ``["tool_*"]``; their
+    nominal values are those of the first such problem. A mapping states patterns per problem: for two arms of one cell
+    and a camera outside, the arms' ``base_*``. With ``read_urdf(..., origins=True)`` joints of one URDF can be shared
+    where chains branch, too.
 
-    InputError for fewer than two problems, a pattern that matches no parameter that several have, shared parameters
-    that are stated differently, repeatability (it is stated of the whole, or learned), data in blocks, and touches of a
-    point that is at another place for another robot.
+    InputError for fewer than two problems, a pattern that matches no parameter of several problems, shared parameters
+    that are stated differently, stated repeatability (state it for the result), data in blocks, and touches of a point
+    that two robots locate at different places.
 
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
@@ -81,7 +81,7 @@ def together(
     robots = {name: part.robot for name, part in parts.items()}
     data = Dataset.of_robots({name: part.data for name, part in parts.items()}).grouped_by_points()
     whole = CalibrationProblem(robots, concatenated(tables), data)
-    shared_bases(whole)  # what is touched by several robots is in one place
+    shared_bases(whole)  # points touched by several robots have one position
     return whole
 
 
@@ -122,10 +122,10 @@ def _common(
 
 
 def identifying_sessions(problem: CalibrationProblem) -> CalibrationProblem:
-    """Return the problem with the sessions of its data identified, as the known ones are.
+    """Return the problem with all sessions of its data identified, like those that are already.
 
-    Their parameters stand behind all others, with the scales of a session that is known; the problem itself where no
-    session is identified, or all are. Rows that name no session are of one more.
+    Their parameters follow all others, with the scales of an identified session; the problem itself is returned if no
+    session is identified, or if all are. Rows without a session form one more.
     """
     p = problem.parameters
     like: dict[str, str] = {}

@@ -12,7 +12,7 @@ from rpim_opt.basics.text import three_digits
 from rpim_opt.data.dataset import Dataset
 
 UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
-"""Unit in which residuals and their standard deviations are reported, and its size in SI."""
+"""Unit in which residuals and their standard deviations are reported, and its value in SI."""
 
 
 def in_unit(error: float | None, dimension: str) -> str:
@@ -25,16 +25,16 @@ def in_unit(error: float | None, dimension: str) -> str:
 class Repeatability:
     """Repeatability of a robot: standard deviations of positions, orientations and joints about its model.
 
-    The covariance of all that was measured in one configuration is::
+    The covariance of all readings of one configuration is::
 
         instrument^2 Sigma + position^2 I_length + orientation^2 I_angle + joint^2 J_theta J_theta'
 
-    with Sigma as the rows state it and J_theta (k, dof) the slopes by the angles of the revolute joints: a joint that
-    stops elsewhere shows in every reflector of a configuration, and the more the longer the lever arm.
+    with Sigma as stated by the rows and J_theta (k, dof) the derivatives by the angles of the revolute joints: the
+    error of a joint affects every reflector of a configuration, in proportion to the lever arm.
 
-    ``position``, ``orientation`` and ``joint`` are standard deviations of every measured length, apart from the joints'
-    part [m], of every measured angle and of every revolute joint [rad]; ``instrument`` multiplies the stated noise.
-    ``at`` (P,) are the values of all parameters at which the joints' slopes are taken [SI], nominal if there are none.
+    ``position`` [m] and ``orientation`` [rad] are standard deviations of every measured length and angle without the
+    joints' part, ``joint`` [rad] that of every revolute joint; ``instrument`` multiplies the stated noise. ``at`` (P,)
+    are the values of all parameters at which the derivatives are taken [SI], nominal if None.
     """
 
     position: float = 0.0
@@ -48,10 +48,10 @@ class Repeatability:
 class Stack:
     """Configurations with the same number k of equations: the components of their noise, one array each.
 
-    ``index`` (N, k) numbers of the equations; ``instrument`` (N, k, k) covariance as the rows state it [SI]; ``length``
-    and ``angle`` (N, k) which are such; ``joint`` (N, k, dof) slopes by the revolute joints' angles [SI], dof columns a
-    stop of the joints, none where not requested; ``unit`` (N, k, k) covariance of a unit standard deviation of every
-    measured position where equations mix several, or a camera sees several points of one, else None: 1 for lengths.
+    ``index`` (N, k) are numbers of the equations; ``instrument`` (N, k, k) is the covariance stated by the rows [SI];
+    ``length`` and ``angle`` (N, k) mark lengths and angles; ``joint`` (N, k, dof) are derivatives by the revolute
+    joints' angles [SI], dof columns per stop of the joints, or none; ``unit`` (N, k, k), or None for 1, is the
+    covariance for unit variance of every position if equations mix several, or a camera sees several points.
     """
 
     index: np.ndarray

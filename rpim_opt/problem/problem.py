@@ -48,30 +48,30 @@ from rpim_opt.robot.parameters import (
 from rpim_opt.robot.terms import Curve, Model, transmission
 
 SHIFTED = ("base_x", "base_y", "base_z")  # parameters that move the whole robot
-MOST_TURNS = 4  # of a joint's value; more are degrees
+MOST_TURNS = 4  # of a joint's value; larger values are degrees
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RobotModel(Tabled):
     """The nominal robots, their parameters and repeatability, common to measurements in memory and in blocks."""
 
-    keeps_rows: ClassVar[bool] = True  # whether `linearize` returns the equations themselves, and not their QR factor
+    keeps_rows: ClassVar[bool] = True  # whether `linearize` returns the equations themselves, not their QR factor
     robots: Robot | Mapping[str, Robot]
     parameters: Parameters
     frozen_functions: Kept | None = field(default=None, repr=False, kw_only=True)
     repeatability: Repeatability | None = field(default=None, kw_only=True)
-    session: str = field(default="", kw_only=True)  # in whose frame `measuring` measures; their mean by default
+    session: str = field(default="", kw_only=True)  # session in whose frame `measuring` measures; default: their mean
 
     def sample(self) -> CalibrationProblem:
         """Return rows that suffice to register frames: all of them, or the first of several blocks."""
         raise NotImplementedError
 
     def identify(self, patterns: Iterable[str]) -> Self:
-        """Return the same problem with just the parameters identified that match one of the patterns.
+        """Return the same problem with the parameters identified that match one of the patterns, and no others.
 
-        These are names with ``*``, ``?`` and ``[...]`` as in file names, or ``"auto"``: the geometry of all links,
+        Patterns are names with ``*``, ``?`` and ``[...]`` as for file names, or ``"auto"``: the geometry of all links,
         Hayati's beta between nearly parallel axes, and the frames that the measurements identify. InputError for a
-        pattern that matches no parameter.
+        pattern without a match.
         """
         p = self.parameters
         return self.with_parameters(p.identify(identifiable(patterns, self.robot, p, self.sample().data)))
@@ -115,9 +115,9 @@ class RobotModel(Tabled):
     def with_model(self, model: Model, identify: Iterable[str] = ("*",)) -> Self:
         """Return the same problem with the terms of a model added to the arm.
 
-        ``identify`` are patterns of the terms' parameters that are identified besides what is; all of them by default.
-        What reads blocks has to read the columns that terms see. InputError for a name that the problem has, a pattern
-        that matches none of the new ones, and data without a column that an identified term needs.
+        ``identify`` are patterns of the terms' parameters that are identified in addition; all of them by default.
+        Functions that read blocks have to read the columns of the terms. InputError for a name that the problem has, a
+        pattern that matches none of the new parameters, and data without a column that an identified term needs.
 
         >>> import rpim_opt as ro
         >>> wave = ro.robot.Term(lambda joint, size: size * joint.q**2, {"bow_mrad": 0.1})
@@ -146,8 +146,8 @@ class RobotModel(Tabled):
     def frozen(self) -> Self:
         """Return a copy that evaluates every measurement model once, now, and keeps the result.
 
-        A measurement of a script may read a variable, an attribute, a file: `residual` and others evaluate it at
-        every call. Within a calibration one answer has to serve from the first iteration to the last.
+        A script's measurement type may depend on a variable, an attribute or a file, and `residual` and others evaluate
+        it at every call. A calibration has to use the same function from the first iteration to the last.
         """
         if self.frozen_functions is not None:
             return self
@@ -161,10 +161,10 @@ class RobotModel(Tabled):
 class CalibrationProblem(RobotModel):
     """Measurements, the nominal robot (several by name, see `together`), and the parameters that explain them.
 
-    The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand in the order
-    of the data's blocks. ``frozen_functions`` are those that `frozen` keeps, None where calls evaluate the measurement
-    models again; ``repeatability`` is the robot's repeatability, None for the instrument's noise alone. InputError when
-    nothing is identified, or the data do not fit the robot or the parameters.
+    The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations have the order of
+    the data's blocks. ``frozen_functions`` are those that `frozen` keeps, None if calls evaluate the measurement
+    models; ``repeatability`` is the robot's, None for the instrument's noise alone. InputError if nothing is
+    identified, or the data do not fit the robot or the parameters.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -214,7 +214,7 @@ class CalibrationProblem(RobotModel):
         if not robot:
             return self
         p = self.parameters.of_robot(robot)
-        others = set(p.terms) - set(arm.model.names(arm.joint_types))  # shared among other robots
+        others = set(p.terms) - set(arm.model.names(arm.joint_types))  # shared by other robots
         own = np.flatnonzero([name not in others for name in p.names])
         repeatability = self.repeatability
         if repeatability is not None and repeatability.at is not None:
@@ -233,7 +233,7 @@ class CalibrationProblem(RobotModel):
     def on(self, data: Dataset) -> CalibrationProblem:
         """Return the same problem with other measurements.
 
-        InputError when data and parameters do not fit, or compliances have measured torques here and not there.
+        InputError if data and parameters do not fit, or if compliances have measured torques only here.
         """
         if not isinstance(data, Dataset):
             raise InputError("data", f"a {type(data).__name__}", "a Dataset, as of Dataset.of(q, y, sigma)")
@@ -256,10 +256,10 @@ class CalibrationProblem(RobotModel):
     ) -> CalibrationProblem:
         """Return the same problem with a reflector measured at joint values q (N, dof) [rad or m], all values zero.
 
-        The reflector is by default that of the first row, or one for each row (N,); ``robot`` is one of several.
-        ``torque`` (N, dof) [Nm], ``payload`` [kg] and further ``columns`` by name [SI], one number or (N,), are what
-        the joints bear. Where the data state directions of approach, the column "approach" (N, dof) holds -1, 0 or 1,
-        by default 0: the joints are in the middle of their backlash. ``covariance`` is as `Dataset.of` takes it.
+        The reflector is by default that of the first row, or one per row (N,); ``robot`` is one of several. ``torque``
+        (N, dof) [Nm], ``payload`` [kg] and further ``columns`` by name [SI], a number or (N,), are the loads and
+        conditions. If the data state directions of approach, the column "approach" (N, dof) has -1, 0 or 1, by default
+        0, the middle of the backlash. ``covariance`` is as for `Dataset.of`.
         """
         arm = self.alone(robot)
         q = np.atleast_2d(np.asarray(q, dtype=float))
@@ -309,7 +309,7 @@ class CalibrationProblem(RobotModel):
         """N labels of the rows."""
         return self.data.label
 
-    # What a row's functions are, and what they return
+    # Arguments and results of the functions of a row
 
     def functions(self, block: Block) -> Functions:
         """Return the functions of a block's rows."""
@@ -318,7 +318,7 @@ class CalibrationProblem(RobotModel):
             absent = (p.nominal == 0) & ~p.identified
             robot = self.arms[block.robot]
             names = p.names
-            if block.robot:  # those of other robots keep their long names, which no formulation uses
+            if block.robot:  # other robots' parameters keep their long names, which no formulation uses
                 visible = set(p.places_of(block.robot).tolist())
                 names = tuple(own_name(name) if i in visible else f".{name}" for i, name in enumerate(names))
             loads = loads_of(robot, needed(robot, p.of_robot(block.robot)), self.data, block)
@@ -385,11 +385,11 @@ class CalibrationProblem(RobotModel):
     def errors(self, x: Array, dimension: str = "length") -> Array:
         """Return the norm of every row's residual at x (n,) [SI], (N,) [m]: for positions and poses the position error.
 
-        ``dimension`` is ``"length"``, or ``"angle"`` for the norm of the angles [rad], for poses the orientation error.
-        Rows without such components get NaN. ``"pixel"``: what cameras are off [px]; their length is by how much the
-        line of sight passes by the point. For touches the length is the distance from the mean of their point's
-        touches, NaN for the only touch of a point. ``"stated length"`` and ``"stated angle"``: of what is known of
-        them, which is no measurement. InputError for another dimension.
+        ``dimension`` is ``"length"``, or ``"angle"`` for the norm of angles [rad], of poses the orientation error. Rows
+        without such components get NaN. ``"pixel"`` is the image error of cameras [px]; their length is the distance
+        between point and line of sight. The length of a touch is its distance from the mean of its point's touches, NaN
+        for a single touch. ``"stated length"`` and ``"stated angle"`` refer to known dimensions of touched objects.
+        InputError for another dimension.
         """
         if not isinstance(dimension, str) or dimension.removeprefix("stated ") not in ("length", "angle", "pixel"):
             raise InputError("dimension", f"{dimension!r}"[:40], "length, angle, pixel, stated length or stated angle")
@@ -406,7 +406,7 @@ class CalibrationProblem(RobotModel):
             if of:
                 errors[block.row] = np.sqrt(np.sum(residual[:, of] ** 2, axis=1))
         for index in self.touches.rows if self.touches else ():
-            if len(index) == 1:  # satisfied by any robot
+            if len(index) == 1:  # any robot satisfies it
                 errors[self._equations.row[index[0]]] = np.nan
         return errors
 
@@ -493,7 +493,7 @@ class CalibrationProblem(RobotModel):
     def contrasts(self, values: Array) -> Array:
         """Return values (m, c) of the equations with the touched points eliminated, (k, c).
 
-        They are what `linearize` whitens, in its order; the values themselves where no row touches a point.
+        They are what `linearize` whitens, in its order; without touches, the values themselves.
         """
         if self.touches is None:
             return values
@@ -520,8 +520,8 @@ class CalibrationProblem(RobotModel):
     def stacks(self, joints: bool = True, at: Array | None = None) -> list[Stack]:
         """Return the equations by configuration, with the components of their noise.
 
-        ``joints``: whether the slopes by the joints' angles are wanted; ``at``: (P,) values of all parameters at which
-        they are taken [SI], None for nominal.
+        ``joints`` states whether derivatives by the joints' angles are included; they are taken at values ``at`` (P,)
+        of all parameters [SI], None for nominal.
         """
         stacks = self._stacked(self._equations.grouped(self.data.configuration[self._equations.row]), joints, at)
         if self.touches is None:
@@ -533,7 +533,7 @@ class CalibrationProblem(RobotModel):
         slopes = self.joint_slopes(at) if joints else None
         shifts = None
         seen = [block.measurement.metres is not None for block in self.data.blocks]
-        if any(seen):  # a camera or a board that the robot holds elsewhere shifts all points of a view together
+        if any(seen):  # an error in the pose of a carried camera or board shifts all points of a view together
             places = {
                 name: SHIFTED.index(own_name(name)) for name in self.parameters.names if own_name(name) in SHIFTED
             }
@@ -544,7 +544,7 @@ class CalibrationProblem(RobotModel):
     def covariances(self, reading: bool = True) -> list[Array]:
         """Return the covariance of every row's residual, block by block, (N, k, k) or (1, k, k) for all [SI].
 
-        ``reading``: of a reading; otherwise without the instrument's part, the robot's repeatability alone.
+        With ``reading``, of a reading; otherwise without the instrument's part, of the robot's repeatability alone.
         """
         repeatability = self.repeatability
         if repeatability is None:
@@ -557,7 +557,7 @@ class CalibrationProblem(RobotModel):
         return of_rows(self.touches, self.data, covariances, reading)
 
     def _slopes_by(self, columns: Mapping[str, int], width: int, at: Array | None) -> Array:
-        """Return the slopes (m, width) of modelled values by parameters, summed in the columns that these have.
+        """Return derivatives (m, width) of modelled values by parameters, summed in the ``columns`` of these by name.
 
         They are taken at values ``at`` (P,) of all parameters [SI]; None for nominal.
         """
@@ -571,7 +571,7 @@ class CalibrationProblem(RobotModel):
         return slopes
 
     def joint_slopes(self, at: Array | None = None, sliding: bool = False) -> Array:
-        """Return the slopes (m, dof) of the modelled values by joint angles [SI]; by strokes zero, unless ``sliding``.
+        """Return derivatives (m, dof) of modelled values by joint angles [SI]; by strokes zero, unless ``sliding``.
 
         They are taken at values ``at`` (P,) of all parameters [SI]; None for nominal.
         """
@@ -581,7 +581,7 @@ class CalibrationProblem(RobotModel):
                 if kind == "revolute" or sliding:
                     zero = f"{'theta' if kind == 'revolute' else 'd'}{i + 1}"
                     joints |= {zero: i, f"{name}.{zero}": i}
-        # the same joint of several robots: a row has slopes by those of its own robot alone
+        # a joint number of several robots: each row has derivatives by its own robot's
         return self._slopes_by(joints, max(len(robot.mdh) for robot in self.arms.values()), at)
 
 
@@ -589,8 +589,8 @@ class CalibrationProblem(RobotModel):
 class Identified(Parameters):
     """The n identified parameters of a linear model, with the problem that positions are predicted from.
 
-    These are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is requested, those that
-    move farthest there are looked at.
+    Positions are linearized about the deviations ``at`` (n,) [SI], or nominal; if a region is requested, they are those
+    of the configurations that move farthest there.
     """
 
     problem: CalibrationProblem | None = None
@@ -627,9 +627,9 @@ def _inverse_root(covariance: Array) -> Array:
 def near_parallel(robot: Robot) -> tuple[str, ...]:
     """Return the Hayati parameters that a robot needs: ``beta{i}`` if the axes of joints i and i+1 are near parallel.
 
-    Parallel axes, turning or sliding, have no single common normal: d and theta then change without bound under a
-    small tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). None where the origins of a
-    URDF's joints are identified.
+    Parallel axes, of rotation or translation, have no unique common normal: a small tilt then changes d and theta
+    without bound, while a rotation about y after joint i describes it (Hayati 1983). None if the origins of a URDF's
+    joints are identified.
     """
     if row_origins(robot.model.terms):
         return ()
@@ -646,14 +646,14 @@ def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, 
         of_fixture(name, block.fixture)
         for block in data.blocks
         for name in block.measurement.parameters
-        if not (block.measurement.by_camera and name.startswith("board_"))  # a board is as large as its file says
+        if not (block.measurement.by_camera and name.startswith("board_"))  # the size of a board is that in its file
     }
     geometry = re.compile(f"{ORIGIN}.*" if row_origins(robot.model.terms) else r"(alpha|a|d|theta)\d+")
     tools = re.compile(r"tool_.*" if any(kind.turning for kind in kinds) else r"tool_(.*_)?[xyz]")
     names = [name for name in parameters.names if geometry.fullmatch(name)]
     names += near_parallel(robot)
     frames = [name for name in parameters.names if name.startswith("base_") or tools.fullmatch(name)]
-    # distances do not depend on the base, and a fixture is placed by it; of a user's type it is what has an effect
+    # distances do not depend on the base, and a fixture is located relative to it; for a user's type its effect decides
     if not any(kind.registers or kind.points > 1 or kind.start or kind.touching for kind in kinds):
         problem = CalibrationProblem(robot, parameters.identify(["base_*", "tool_*"]), data)
         slopes = np.abs(problem.linearize(np.zeros(len(problem.parameters.free))).A).max(axis=0)

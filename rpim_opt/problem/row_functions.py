@@ -21,24 +21,24 @@ from rpim_opt.robot.parameters import EXPANSION, REFERENCE, Parameters, of_term,
 from rpim_opt.robot.terms import SYMBOLS, Configuration, Dependencies, Symbol, Term, Weight, dependencies
 
 Functions = Mapping[str, ca.Function]
-"""``residual``, ``jacobian``, ``modelled``, ``metres`` of one row; inputs are deviations, nominal values, the row."""
+"""``residual``, ``jacobian``, ``modelled``, ``metres`` of a row; arguments are deviations, nominal values, the row."""
 
 transform = Measurement(
     "transform", lambda T: ca.vec(T.T), {f"t{i}{j}": "" for i in range(4) for j in range(4)}, noise={"entry": ""}
 )
-"""The reflector's transform itself, row by row: what a calibrated robot's forward kinematics evaluate."""
+"""The reflector's transform itself, row by row, as evaluated by a calibrated robot's forward kinematics."""
 
-MANY = 1024  # functions that are kept, some hundred kB each: of some hundred reflectors each has its own
+MANY = 1024  # functions kept, some hundred kB each; each reflector has its own
 _READY = frozenset({*READY.values(), transform})
 
 
 class Structure(NamedTuple):
-    """What decides the functions of a block's rows besides the measurement.
+    """Properties of a block that determine the functions of its rows besides the measurement.
 
     ``identified`` and ``absent`` are (P,) true or false as bytes; absent parameters are zero and not identified.
-    ``loads`` are what a row states besides joint values, and the gravity that its joints' terms see; ``terms`` are a
-    user's own; ``several`` whether other robots have rows, too; ``sessions`` the prefixes of what shifts the base, each
-    with a column that is 1 where a row is of that session.
+    ``loads`` are the quantities of a row besides joint values, and the gravity of its joints' terms; ``terms`` are
+    user-defined; ``several`` states whether other robots have rows; ``sessions`` are prefixes of session offsets, each
+    with a column that is 1 for rows of that session.
     """
 
     joint_types: tuple[str, ...]
@@ -54,7 +54,7 @@ class Structure(NamedTuple):
 
 
 Kept = dict[tuple[Structure, Measurement], Functions]
-"""A user's functions as they were built first: what they read may be another value later, or in another process."""
+"""A user's functions as first built: their variables may have other values later, or in another process."""
 
 
 def row_functions(structure: Structure, measurement: Measurement, kept: Kept) -> Functions:
@@ -69,7 +69,7 @@ def row_functions(structure: Structure, measurement: Measurement, kept: Kept) ->
 def _built(structure: Structure, measurement: Measurement) -> Functions:
     with SYMBOLS:
         inputs, (residual, modelled, metres) = _expressions(structure, measurement)
-        # evaluated rows are transposed: the derivative by x stands in rows
+        # evaluated rows are transposed: derivatives by x are in rows
         transposed = ca.densify(-ca.jacobian(residual, inputs[0]).T)
         return {
             "residual": ca.Function("residual", inputs, [residual]),
@@ -88,7 +88,7 @@ class _Parameters:
     def __init__(self, of: Structure) -> None:
         there = np.flatnonzero(~np.frombuffer(of.absent, dtype=bool))
         free = np.flatnonzero(np.frombuffer(of.identified, dtype=bool))
-        self._start = {of.names[i]: int(i) for i in there}  # nominal values that are not zero, or identified
+        self._start = {of.names[i]: int(i) for i in there}  # nonzero or identified nominal values
         self._free = {of.names[i]: k for k, i in enumerate(free)}
         self.x = ca.SX.sym("x", len(self._free))
         self.nominal = ca.SX.sym("nominal", len(of.names))
@@ -126,22 +126,22 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
     symbols = of.loads.symbols(len(of.joint_types), points)
     session = ca.SX.sym("session", len(of.sessions))
     y = ca.SX.sym("y", len(measurement.columns))
-    # every point's reflector in the frame that measures
+    # every point's reflector in the measuring frame
     transforms = []
     for point, marker in enumerate(of.markers):
         configuration = of.loads.configuration(of.joint_types, p.start, symbols, point)
         factors = []
-        if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
+        if of.several or not measurement.touching:  # touches of one robot differ equally for any base
             factors += p.frame("base_")
         if of.sessions:
             factors += p.chosen(of.sessions, session)
         flange = chain(of.joint_types, configuration, p.value, of.terms)
         temperature = configuration.columns.get("temperature")
-        if temperature is not None:  # all lengths have grown: the flange is as far again from the base
+        if temperature is not None:  # all lengths expand: the flange's distance from the base, too
             growth = p.value(EXPANSION) * (temperature - p.value(REFERENCE))
             factors.append(translation(*ca.vertsplit(growth * product(flange)[:3, 3])))
         transforms.append(product([*factors, *flange, *p.frame(tool_prefix(marker))]))
-    # frames, parameters and columns that the model takes by name
+    # frames, parameters and columns passed to the model by name
     own: dict[str, Symbol] = {name: product(p.frame(of_fixture(name + "_", of.fixture))) for name in measurement.frames}
     in_frames = tuple(f"{prefix}_" for prefix in measurement.frames)
     for name in measurement.parameters:
@@ -168,9 +168,9 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
 
 
 RowSymbols = Mapping[str, ca.SX]
-"""The symbols of what a row states of its joints, point by point, in the order of `loads_in`."""
-PER_JOINT = ("q", "torque", "approach")  # what a row states of every joint
-COLUMN = "column "  # before the name of a further column among what a row states
+"""Symbols of a row's quantities per joint, point by point, in the order of `loads_in`."""
+PER_JOINT = ("q", "torque", "approach")  # a row's quantities per joint
+COLUMN = "column "  # prefix of a further column among a row's quantities
 
 
 class Loads(NamedTuple):
@@ -295,7 +295,7 @@ def masses_assumed(robot: Robot, parameters: Parameters, data: Dataset) -> bool:
 def require_known_masses(robot: Robot, parameters: Parameters, data: Dataset, payload: Array) -> None:
     """Refuse payloads [kg] that were not measured, where masses of the links are assumed.
 
-    Compliances take up how wrong these masses are: not the payload's.
+    Compliances absorb the error of these masses, but not the payload's.
     """
     if not masses_assumed(robot, parameters, data):
         return

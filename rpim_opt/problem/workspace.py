@@ -23,9 +23,9 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
 SOME = 128
-"""Configurations of a box, or of all joint ranges, that are always looked at; and those of all that move farthest."""
+"""Configurations of a box, or of all joint ranges, that are always used; and most of those that move farthest."""
 ALL, DRAWN, ROUNDS = 2048, 4096, 16
-"""Configurations that stand for a box, or all joint ranges; drawn at once to find those, and how often at most."""
+"""Configurations that represent a box or all joint ranges; number drawn at once to find them, most repetitions."""
 
 
 class Predicted(NamedTuple):
@@ -84,7 +84,7 @@ def _in_box(problem: CalibrationProblem, box: tuple[tuple[float, float], ...], m
 def within(problem: CalibrationProblem, box: Array | None = None, marker: str | None = None) -> Array:
     """Return configurations (N, dof) that represent all joint ranges, or those with the nominal reflector in a box.
 
-    Its corners are (3, 2) [m] in the base frame.
+    ``box`` has sides (3, 2) [m] in the base frame.
     """
     if box is None:
         return random_candidates(problem.robot, ALL)
@@ -108,11 +108,11 @@ def in_base(problem: CalibrationProblem, q: Array, marker: str | None = None) ->
     return problem.measuring(q, revisit, marker).modelled(np.zeros(len(problem.parameters.free)))[0]
 
 
-DRAWS = 200  # random configurations that are tried for each row
-FIRST, FAR = 10, 1e-3  # after so many draws a row is out of reach from which the nearest configuration is further [m]
-LONGEST, DIFFERENCE = 0.1, 1e-4  # largest step, and step of the central differences, in ranges of the joints
-DAMPING = 1e-9  # square of the slopes [m^2] at which a step is half as long: a stretched arm does not leap
-THERE = 1e-11  # largest distance [m] of a configuration from its target; one more step then leaves rounding alone
+DRAWS = 200  # random configurations tried per row
+FIRST, FAR = 10, 1e-3  # a row is unreachable if after so many draws the nearest configuration is further away [m]
+LONGEST, DIFFERENCE = 0.1, 1e-4  # largest step, and step of central differences, in ranges of the joints
+DAMPING = 1e-9  # squared derivative [m^2] that halves a step: a stretched arm does not jump
+THERE = 1e-11  # largest distance [m] of a configuration from its target; one more step then leaves rounding only
 
 
 def configurations_at(
@@ -125,10 +125,10 @@ def configurations_at(
 ) -> Array:
     """Return joint values (N, dof) [rad or m] at which the tool is at N points.
 
-    From random configurations, as `random_candidates` draws them, by Newton's steps (`Target`), all the way within the
-    joints' limits. Of the problem robot, tools and what the joints bear count. ``points`` are (N, 3) in the robot's
-    base frame [m]; ``x`` (n,) deviations of the identified parameters [SI], nominal by default; ``marker`` the tool,
-    that of the data's first row by default. InputError for a point that none of `DRAWS` random configurations leads to.
+    Newton's steps (`Target`) start at random configurations, drawn as by `random_candidates`, and stay within the joint
+    limits. Robot, tools and loads are the problem's. ``points`` are (N, 3) in the robot's base frame [m]; ``x`` (n,)
+    are deviations of the identified parameters [SI], nominal by default; ``marker`` is the tool, by default that of the
+    data's first row. InputError for a point that none of `DRAWS` random configurations leads to.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -158,7 +158,7 @@ def configurations_at(
 class Target(NamedTuple):
     """Equations of inverse kinematics: e (M, k) [m] of ``away`` at joint values (M, dof) of rows (M,).
 
-    Newton's steps of least norm, in units u of the joints' ranges and ``within`` (dof, 2), lead there::
+    Newton's steps of least norm, in units u of the joints' ranges and ``within`` (dof, 2), are::
 
         u <- u - G' (G G' + d)^-1 e,    G = de / du,    d the damping [m^2]
     """
@@ -169,10 +169,10 @@ class Target(NamedTuple):
     damping: float = DAMPING
 
     def reached(self, count: int, rng: np.random.Generator, share: float) -> tuple[Array, int | None]:
-        """Return joint values (``count``, dof) [rad or m], and the row that is out of reach, if there is one.
+        """Return joint values (``count``, dof) [rad or m], and the row that is unreachable, if any.
 
-        A configuration that does not get there is drawn again, from a share of the ranges; rows do not depend on each
-        other. What processors differ by in rounding grows 100 times at worst, to a thousandth of what a table prints.
+        A configuration that does not converge is drawn again, from a share of the ranges; rows are independent of each
+        other. Rounding differences between processors grow 100 times at worst, to a thousandth of a table's last digit.
         """
         low, high = np.array([[-np.inf], [np.inf]]) if self.within is None else self.within.T
         least, most = (self.robot.limits if self.within is None else self.within).T
@@ -181,16 +181,16 @@ class Target(NamedTuple):
         nearest = np.full(count, np.inf)
         for draw in range(DRAWS):
             rows = np.flatnonzero(missing)
-            # drawn for all rows, also those that are there: a row's draws do not depend on another row's luck
+            # drawn for all rows, also converged ones: a row's draws do not depend on other rows
             q = random_candidates(self.robot, count, rng, share)[rows]
             there = np.zeros(len(q), dtype=bool)
-            for _ in range(40):  # some dozen long steps until the target is near, then a few to rounding
+            for _ in range(40):  # some dozen long steps to the target, then a few to rounding
                 way = np.flatnonzero(~there)
                 q[way] = np.clip(q[way] + self._step(q[way], rows[way]), low, high)
                 there[way] = np.linalg.norm(self.away(q[way], rows[way]), axis=1) < THERE
                 if there.all():
                     break
-            # a last step for all: rounding is then all that is left, the same on every processor
+            # a last step for all leaves rounding only, the same on every processor
             q = q + self._step(q, rows)
             reached[rows] = q
             missing[rows] = ~there | np.any((q < least) | (q > most), axis=1)
@@ -210,7 +210,7 @@ class Target(NamedTuple):
         e = self.away(near.reshape(-1, dof), np.tile(rows, 2 * dof + 1)).reshape(2 * dof + 1, M, -1)
         G = np.moveaxis(e[1 : dof + 1] - e[dof + 1 :], 0, 2) / (2 * DIFFERENCE)
         damped = np.tile(np.sqrt(self.damping) * np.eye(e.shape[2]), (M, 1, 1))
-        # [G'; sqrt(d) I] = Q R leaves more digits than G G' + d where an arm is nearly stretched
+        # [G'; sqrt(d) I] = Q R keeps more digits than G G' + d if an arm is nearly stretched
         Q, R = np.linalg.qr(np.concatenate([G.transpose(0, 2, 1), damped], axis=1))
         step = -(Q[:, :dof] @ np.linalg.solve(R.transpose(0, 2, 1), e[0][:, :, None]))[:, :, 0]
         length = np.linalg.norm(step, axis=1)
@@ -223,15 +223,15 @@ def touched_place(problem: CalibrationProblem) -> Array:
     if not centres:
         raise InputError("the data", "no touch of a point", 'rows of measurement = "revisit"')
     middle = np.mean(centres, axis=0)
-    # one of them: their middle may be where no tool reaches
+    # one of them: their mean may be unreachable
     return min(centres, key=lambda centre: float(np.sum((centre - middle) ** 2)))
 
 
-TIMES = 100  # how often configurations are drawn to find some in which the board is visible
-MARGIN = 0.04  # part of the image along its edges in which no point appears
-LARGE = 0.15  # least width of a board in the image, as part of the image's
+TIMES = 100  # repetitions of draws to find some configurations with a visible board
+MARGIN = 0.04  # margin of the image without points, as a part of its size
+LARGE = 0.15  # least width of a board in the image, as a part of the image's
 UPRIGHT = 0.5
-"""Least cosine between line of sight and the board's normal: corners of a board that leans more are not found."""
+"""Least cosine between line of sight and the board's normal: corners of a more inclined board are not found."""
 
 
 def visible_configurations(
@@ -243,11 +243,11 @@ def visible_configurations(
     share: float = 1.0,
     image: tuple[float, float] = (1280, 960),
 ) -> Array:
-    """Return joint values (count, dof) [rad or m] at which a camera sees all of its board, large and upright enough.
+    """Return joint values (count, dof) [rad or m] at which a camera sees its whole board, large and upright enough.
 
-    They are drawn as by `random_candidates`. Frames and intrinsics are those of the problem's camera, at deviations
-    ``x`` (n,) [SI], nominal by default; ``points`` are (P, 3) of the board [m], ``image`` is width and height [px].
-    InputError for a problem without a camera, and a board that is hardly ever visible.
+    They are drawn as by `random_candidates`. Frames and intrinsics are the problem's, at deviations ``x`` (n,) [SI],
+    nominal by default; ``points`` are (P, 3) of the board [m], ``image`` is width and height [px]. InputError for a
+    problem without a camera, and a board that is hardly ever visible.
 
     >>> import numpy as np
     >>> import rpim_opt as ro

@@ -18,10 +18,10 @@ from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.data.measurements.pose import from_matrices, pose
 from rpim_opt.problem.registration.closed_forms import proper, rigid, transformed
 
-FEWEST = {True: 4, False: 6}  # points that a view of a plane, and of points in space, has to show
-FLAT = 1e-6  # third singular value of a board's points over the first, below which they are in a plane
-LEAST_VIEWS = 3  # views that show focal lengths and centre
-UNCERTAIN = 3.0  # by how much a view's pose is less certain than its points would be alone
+FEWEST = {True: 4, False: 6}  # least number of points in a view: of a plane, of points in space
+FLAT = 1e-6  # third over first singular value of a board's points, below which they are planar
+LEAST_VIEWS = 3  # views that determine focal lengths and centre
+UNCERTAIN = 3.0  # factor on the uncertainty of a view's pose beyond that of its points
 
 
 def camera_blocks(data: Dataset) -> list[Block]:
@@ -34,7 +34,7 @@ def normalized(uv: Array, camera: Mapping[str, float]) -> Array:
     k1, k2, p1, p2, k3 = (camera.get(name, 0.0) for name in ("k1", "k2", "p1", "p2", "k3"))
     seen = (uv - [camera["cx"], camera["cy"]]) / [camera["fx"], camera["fy"]]
     xy = seen
-    for _ in range(30):  # each leaves a small part of the last one's error
+    for _ in range(30):  # every iteration leaves a small part of the error
         x, y = xy.T
         r2 = x**2 + y**2
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
@@ -44,22 +44,22 @@ def normalized(uv: Array, camera: Mapping[str, float]) -> Array:
 
 
 def view_pose(points: Array, xy: Array) -> Array:
-    """Return the board in the camera's frame (4, 4) [m], from where its points are seen: PnP.
+    """Return the pose of the board in the camera's frame (4, 4) [m] from its points' image: PnP.
 
-    By a homography for points in a plane, the direct linear transform for others, and least squares from there; of a
-    plane's two poses that look alike the one that fits better.
+    The start is a homography for planar points and the direct linear transform for others, followed by least squares;
+    of the two similar poses of a plane the better fit is taken.
 
-    ``points`` are (P, 3) on the board [m], ``xy`` (P, 2) directions, as `normalized` has them. Refused are fewer than
-    four points of a plane, or six in space, and points on a line.
+    ``points`` are (P, 3) on the board [m], ``xy`` (P, 2) directions as returned by `normalized`. InputError for fewer
+    than four points of a plane or six in space, and for collinear points.
     """
     middle, axes, planar = _plane(points)
     local = (points - middle) @ axes.T
     if planar:
-        H = _linear(local[:, :2], xy)  # its columns are two axes of the board and its origin, before the camera
+        H = _linear(local[:, :2], xy)  # columns: two axes of the board and its origin, in front of the camera
         H = H / np.copysign(np.sqrt(np.linalg.norm(H[:, 0]) * np.linalg.norm(H[:, 1])), H[2, 2])
         first = rigid(proper(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])])), H[:, 2])
-        # the pose whose normal leans to the other side of the line of sight looks much alike from far away: half a turn
-        # about the line of sight, and half a turn about the board's normal
+        # the pose with the normal tilted to the other side of the line of sight looks similar from far away: half a
+        # turn about the line of sight, and half a turn about the board's normal
         sight = first[:3, 3] / np.linalg.norm(first[:3, 3])
         turn = np.diag([-1.0, -1.0, 1.0])
         to = scipy.spatial.transform.Rotation.align_vectors([[0, 0, 1]], [sight])[0].as_matrix()
@@ -185,10 +185,10 @@ def _views(data: Dataset, block: Block, own: Mapping[str, float]) -> tuple[np.nd
     points = targets(block)
     xy = normalized(block.y, camera)
     _, _, planar = _plane(points)
-    placed = []  # the first entry of each view, and its pose
+    placed = []  # first entry of each view, and its pose
     for view in rows_by_view(data, block):
         if len(view) >= FEWEST[planar]:
-            with suppress(InputError):  # points on a line
+            with suppress(InputError):  # collinear points
                 placed.append((int(view[0]), view_pose(points[view], xy[view])))
     if not placed:
         raise InputError("the camera", "no view that determines a pose", f"views of {FEWEST[planar]} points or more")

@@ -16,12 +16,12 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, proper, rigid
 
-GAP = 1e-3  # what cost and bound may differ by, in units of one plus the cost: a chi-squared means nothing finer
-UNKNOWN = 0.1  # standard deviation of a rotation [rad] from which it is not determined
-FAR = 0.5  # angle [rad] within which all starts have to be that fit as well, for there to be one
-AS_WELL = 1e-4  # probability that the truth fits worse than what counts as fitting as well
+GAP = 1e-3  # tolerance of cost minus bound, over one plus the cost: a finer chi-squared has no meaning
+UNKNOWN = 0.1  # standard deviation of a rotation [rad] above which it is undetermined
+FAR = 0.5  # angle [rad] within which all equally good starts have to be, for the solution to be unique
+AS_WELL = 1e-4  # probability that the truth fits worse than an equally good start
 RIDGE = 1e-6
-"""How certain an expected translation is at least, in units of all positions together: what they do not show stays."""
+"""Least certainty of an expected translation, in units of all positions together: undetermined directions stay."""
 FEWEST = 3  # measurements
 LINEAR = 6  # unknowns that are eliminated exactly: the translations t of the tool and u of the base
 
@@ -36,20 +36,20 @@ class CertifiedStart:
         bound <= cost of any base and tool whatever
         gap    = (cost - bound) / (1 + cost)
 
-    Angles are in rad; ``bound`` and ``radius`` are proven. ``certified`` says that the optimum is global, the only one
-    and determined.
+    Angles are in rad; ``bound`` and ``radius`` are proven. ``certified`` states that the optimum is global, unique and
+    determined.
     """
 
     base: Array  # (4, 4) transform of the robot's base in the instrument's frame [m]
-    tool: Array  # (4, 4) of the target in the flange frame; not turned by positions alone
+    tool: Array  # (4, 4) of the target in the flange frame; without rotation for positions
     cost: float
     bound: float
     gap: float
-    rank_ratio: float  # second over first eigenvalue of the moment matrix: zero where the relaxation is tight
+    rank_ratio: float  # second over first eigenvalue of the moment matrix: zero if the relaxation is tight
     uncertainty: float  # standard deviation of the least certain rotation
-    radius: float  # angle from these rotations beyond which all others fit worse by more than noise explains
+    radius: float  # angle from these rotations [rad] beyond which all others fit worse by more than noise explains
     certified: bool
-    reason: str  # why it is certified or not, in a sentence
+    reason: str  # sentence on why it is certified or not
 
 
 @one_blas_thread
@@ -73,10 +73,10 @@ def certified_hand_eye(
 
     ``flange`` (N, 4, 4) are transforms of the flange in the robot's base [m], ``measured`` (N, 4, 4) of the tool in the
     instrument's frame, NaN for rotations that were not measured; or positions (N, 3). ``sigma`` are the standard
-    deviations of a position [m] and an orientation [rad], each a number or (N,): of the instrument and of the robot,
-    which differs from the nominal one. The tool is ``expected`` (3,) in the flange frame [m] with the standard
-    deviation ``spread`` [m]; a direction that the measurements do not show stays there in any case. InputError for
-    fewer than three measurements, and what is no transform.
+    deviations of a position [m] and an orientation [rad], each a number or (N,): those of the instrument and of the
+    nominal robot together. The tool is ``expected`` (3,) in the flange frame [m] with standard deviation ``spread``
+    [m]; directions that the measurements do not determine always stay there. InputError for fewer than three
+    measurements, and invalid transforms.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -149,15 +149,15 @@ def _checked(flange: Array, measured: Array) -> tuple[Array, Array, np.ndarray]:
 def _equations(
     flange: Array, measured: Array, turned: np.ndarray, sigma: Array, expected: Array, spread: float
 ) -> Array:
-    """Return J (12 N + 3, n): loops ``measured = base flange tool`` and what is expected of t are J v.
+    """Return J (12 N + 3, n): the loops ``measured = base flange tool`` and the expected t have residuals J v.
 
     ::
 
         v = (t, u, 1, vec Z_R, vec X_R'),  rotations' rows first,    t = X_t,  u = Z_R' Z_t
         (Z_R' y - A_R t - A_t - u) / sigma_position
-        (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    where the orientation was measured
+            (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    if the orientation was measured
 
-    The norm of the last is the angle between the two, up to third order. X_R is left out where nothing turned.
+    The norm of the last is the angle between the two, up to third order. X_R is left out without orientations.
     """
     N = len(flange)
     eye = np.eye(3)
@@ -183,9 +183,9 @@ def _equations(
 
 # --- quadratic forms of rotations: relaxation, rounding, refinement and a lower bound -----------------------------
 
-TOLERANCE = 1e-8  # of gap and feasibility, the form being of size one: what follows refines rotations and multipliers
+TOLERANCE = 1e-8  # of gap and feasibility, in units of the form; rotations and multipliers are refined afterwards
 SPREAD = 1e-3
-"""Second over first eigenvalue from which moments are those of several rotations, and a few are drawn from them."""
+"""Second over first eigenvalue above which moments mix several rotations, and some are drawn from them."""
 CROSS = -np.cross(np.eye(3)[:, None], np.eye(3))  # the matrices of the cross products e_a x
 
 
@@ -193,8 +193,8 @@ CROSS = -np.cross(np.eye(3)[:, None], np.eye(3))  # the matrices of the cross pr
 def rotation_constraints(count: int) -> Array:
     """Return C (c, n, n) with x'C x = 0 for x = (1, vec R_1, ..., vec R_count), rows first, and no other quadratic.
 
-    Of every rotation the twenty independent ones: R R' = 1 and R'R = 1, of which one diagonal entry follows from the
-    others, and each row the cross product of the next two, so that R is right-handed.
+    These are the twenty independent ones of every rotation: R R' = 1 and R'R = 1, where one diagonal entry follows from
+    the others, and each row as the cross product of the next two, so that R is right-handed.
     """
     C = np.zeros((20 * count, 1 + 9 * count, 1 + 9 * count))
     number = 0
@@ -223,15 +223,15 @@ def relax(Q: Array) -> tuple[Array, Array]:
         subject to  Q - bound e e' - sum_j multipliers_j C_j  positive semidefinite,    e = (1, 0, ..., 0)
 
     For rotations the left side of the constraint times x x' is x'Q x - bound >= 0: no rotation has a smaller value. The
-    constraint's own multiplier is the moment matrix, which minimizes <Q, M> over all positive semidefinite M with
-    M_00 = 1 and <C_j, M> = 0: x x' where rotations are its solution.
+    constraint's multiplier is the moment matrix, which minimizes <Q, M> over all positive semidefinite M with M_00 = 1
+    and <C_j, M> = 0; it is x x' if the relaxation is tight.
     """
     clarabel = import_module("clarabel")
     n = len(Q)
     first = np.zeros((1, n, n))
     first[0, 0, 0] = 1.0
     columns, rows = np.tril_indices(n)
-    root = np.where(rows == columns, 1.0, np.sqrt(2))  # the cone's norm is that of the matrix
+    root = np.where(rows == columns, 1.0, np.sqrt(2))  # the cone's norm is the matrix norm
     C = np.concatenate([first, rotation_constraints((n - 1) // 9)])
     A = scipy.sparse.csc_matrix((root * C[:, rows, columns]).T)
     size = float(np.abs(Q).max()) or 1.0
@@ -241,7 +241,7 @@ def relax(Q: Array) -> tuple[Array, Array]:
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
-    settings.iterative_refinement_enable = False  # half of the time, for digits that are refined later
+    settings.iterative_refinement_enable = False  # takes half of the time, for digits that are refined later
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
     P = scipy.sparse.csc_matrix((len(q), len(q)))
     solution = clarabel.DefaultSolver(P, q, A, b, [clarabel.PSDTriangleConeT(n)], settings).solve()
@@ -256,13 +256,13 @@ class Smallest:
 
     rotations: Array
     value: float
-    bound: float  # no rotations have less, up to rounding
-    rank_ratio: float  # second eigenvalue of the moment matrix over the first: zero where it is of rank one
-    information: Array  # (3k, 3k) half the Hessian by turns [1/rad^2]
-    steepness: float  # c: every x has at least bound + c |x_other|^2, x_other being what is not along the best
+    bound: float  # no rotations have a smaller value, up to rounding
+    rank_ratio: float  # second over first eigenvalue of the moment matrix: zero for rank one
+    information: Array  # (3k, 3k) half the Hessian by rotations [1/rad^2]
+    steepness: float  # c: every x has at least bound + c |x_other|^2, x_other being the part perpendicular to the best
 
     def radius(self, excess: float) -> float:
-        """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than this.
+        """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than ``excess``.
 
         Both x have the length n = 1 + 3 k, squared, so that c = x'x_best / n has 1 - c^2 = |x_other|^2 / n, and
         |x - x_best|^2 = 2 n (1 - c), of which one rotation has 8 sin^2(angle / 2). A trace of -1 or more keeps c above
@@ -280,22 +280,22 @@ class Smallest:
 
 
 def smallest(L: Array) -> Smallest:
-    """Return the best rotations that the relaxation leads to, with its bound.
+    """Return the best rotations that the relaxation yields, with its bound.
 
     ::
 
         Q - f e e' - sum_j multipliers_j C_j  >=  mu 1,    mu <= 0
         x'Q x  >=  f + mu |x|^2  =  f + mu (1 + 3 k)    for every x = (1, vec R_1, ..., vec R_k)
 
-    The multipliers are the solver's, moved by the least that makes the left side vanish on the rotations found, with f
-    their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
+    The multipliers are the solver's, with the least change that makes the left side vanish on the rotations found, and
+    f is their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
     """
     Q = L.T @ L
     moments, multipliers = relax(Q)
     eigenvalues, vectors = np.linalg.eigh(moments)
     rank_ratio = float(abs(eigenvalues[-2]) / eigenvalues[-1])
-    lifts = [moments[:, 0]]  # the mean of the rotations that the moments stand for
-    if rank_ratio > SPREAD:  # and some that are drawn from them
+    lifts = [moments[:, 0]]  # the mean rotations of the moments
+    if rank_ratio > SPREAD:  # and some drawn from them
         normal = np.random.default_rng(0).normal(size=(20, len(eigenvalues)))
         lifts += [*(normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T)]
     rounded = [_refined(L, proper(np.copysign(1.0, lift[0]) * lift[1:].reshape(-1, 3, 3))) for lift in lifts]

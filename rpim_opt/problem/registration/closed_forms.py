@@ -10,9 +10,9 @@ import scipy
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 
-Place = Sequence[float] | Array  # A frame's six numbers, or a point's three
+Place = Sequence[float] | Array  # a frame's six numbers, or a point's three
 NOMINAL_ERROR, TOOL_ERROR = 5e-3, 0.1
-"""What a nominal robot (also in angle, at a metre) and a roughly measured reflector may be wrong by [m, rad]."""
+"""Assumed errors of a nominal robot (also of its angles, at 1 m) and of a roughly measured reflector [m, rad]."""
 
 
 def register(source: Array, target: Array) -> Array:
@@ -20,8 +20,8 @@ def register(source: Array, target: Array) -> Array:
 
     The rotation is proper (det R = 1), by singular value decomposition (Umeyama 1991, IEEE PAMI 13:376).
 
-    ``source`` and ``target`` are N points (N, 3) [m]. Refused are fewer than three points, points that coincide, and
-    points on a line: their rotation is arbitrary.
+    ``source`` and ``target`` are N points (N, 3) [m]. InputError for fewer than three points, and for coincident or
+    collinear points, whose rotation is arbitrary.
     """
     source, target = np.asarray(source, dtype=float), np.asarray(target, dtype=float)
     if source.shape != target.shape or source.shape[1:] != (3,):

@@ -39,16 +39,16 @@ from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, model_parameters, tool_prefix
 
-SETTLED = 6  # rows of a session that determine base and reflector well enough to compare others with them
-ENOUGH = 2000  # rows of a measurement that register frames, where there are more
+SETTLED = 6  # rows of a session that determine base and reflector well enough for comparing others
+ENOUGH = 2000  # most rows of a measurement used to register frames
 
 
 def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Array, dict[str, Array], str]:
     """Return the base (6,), the reflectors (6,) by marker [m, rad], and a sentence on the method.
 
-    They are those of positions and poses on the nominal robot, by `certified_hand_eye`; of several reflectors by that
-    with the most poses, or positions, from which the others follow. Where it does not determine the rotations, all
-    positions are fitted with reflectors near where they are stated. Of `sessions_apart` that with the most rows counts.
+    They are registered from positions and poses on the nominal robot by `certified_hand_eye`: with several reflectors
+    from the one with the most poses, or positions, from which the others follow. If that does not determine the
+    rotations, all positions are fitted, reflectors near their stated places. Of `sessions_apart` the largest counts.
     """
     if sessions_apart(robot, data, tools):
         data = largest_session(data)
@@ -69,7 +69,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
     flange = forward_kinematics(robot, q)
     y = measured[:, :3, 3]
     turned = ~np.isnan(measured[:, 0, 0])
-    sigma = np.sqrt(variance + NOMINAL_ERROR**2)  # of the instrument and of the nominal robot together
+    sigma = np.sqrt(variance + NOMINAL_ERROR**2)  # of instrument and nominal robot together
     places = {name: np.array(place, dtype=float) for name, place in tools.items()}
     count = Counter(marker[turned].tolist() or marker.tolist())
     first = count.most_common(1)[0][0]
@@ -95,13 +95,13 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         how = f"optimum of the registration {'' if start.certified else 'not '}certified: {start.reason}"
         base = start.base
         places[first][:3] = start.tool[:3, 3]
-        for other in places.keys() - {first}:  # where their positions are least off, seen from the base
+        for other in places.keys() - {first}:  # where their positions fit best, seen from the base
             own = marker == other
             back: Any = np.linalg.inv(base @ flange[own])
             precision = sigma[own, 0] ** -2
             total = places[other][:3] * TOOL_ERROR**-2 + precision @ transformed(back, y[own])
             places[other][:3] = total / (TOOL_ERROR**-2 + precision.sum())
-    for name in np.unique(marker[turned]).tolist():  # turned as poses show
+    for name in np.unique(marker[turned]).tolist():  # with the orientation of the poses
         own = turned & (marker == name)
         turn = (base @ flange[own])[:, :3, :3].transpose(0, 2, 1) @ measured[own, :3, :3]
         places[name] = frame_numbers(rigid(proper(turn.sum(axis=0)), places[name][:3]))
@@ -120,11 +120,11 @@ def largest_session(data: Dataset) -> Dataset:
 
 
 def sessions_apart(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> dict[str, float]:
-    """Return the session with the most rows, and those with the instrument or base elsewhere; none without sessions.
+    """Return the session with the most rows, and those with another place of instrument or base; none without sessions.
 
-    The nominal robot is registered to the first one, with reflectors starting at ``tools``; a session's figure is the
-    RMS distance [m] of its points from there. It stands apart if that is several times what a nominal robot, or the
-    session's own registration, leaves.
+    The nominal robot is registered to the first one, with reflectors starting at ``tools``; the value of a session is
+    the RMS distance [m] of its points from this registration. A session is apart if that is several times the error of
+    a nominal robot, or of the session's own registration.
     """
     here = largest_session(data)
     blocks = [block for block in data.blocks if block.measurement.name in ("position", "pose")]
@@ -132,7 +132,7 @@ def sessions_apart(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> d
         return {}
     try:
         base, places, _ = locate(robot, here, tools)
-    except InputError:  # its rotations are not determined
+    except InputError:  # undetermined rotations
         return {}
     session, y, modelled = (np.concatenate(each) for each in zip(*(
         (b.session_names, b.y[:, :3], transformed(forward_kinematics(robot, b.q[:, 0]), places[b.markers[0]][:3]))
@@ -142,7 +142,7 @@ def sessions_apart(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> d
     off = {str(here.session[0]): 0.0}
     for name in set(session) - set(off):
         own, there = y[session == name], modelled[session == name]
-        with suppress(InputError):  # too few, or on a line
+        with suppress(InputError):  # too few, or collinear
             error, alone = there - own, transformed(register(there, own), there) - own
             far, left = (rms(np.linalg.norm(each, axis=1)) for each in (error, alone))
             if far > MISPLACED * max(NOMINAL_ERROR, left):
@@ -151,21 +151,21 @@ def sessions_apart(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> d
 
 
 APART = 0.1
-"""How far nominal robots may be from each other at a point that both have touched [m], until it is another point."""
+"""Largest distance [m] between nominal robots at a point that both touched; beyond, it is another point."""
 
 
 def shared_bases(problem: CalibrationProblem) -> dict[str, Array]:
-    """Return bases (6,) by robot, of nominal robots that touched the same points as robots before them.
+    """Return bases (6,) by robot for nominal robots that touched the same points as earlier robots.
 
-    The first robot that touched something stands where it is stated, as does one whose base is not identified, and one
-    that an instrument has seen. Each other one is put where its touches are nearest to those of the robots so far.
+    The first robot that touched something keeps its stated base, as does one whose base is not identified, or that an
+    instrument measured. Each other base minimizes the distances of the robot's touches from those of the robots so far.
     """
     known: dict[str, Array] = {}
     bases = {}
     for robot in problem.arms:
         alone = problem.alone(robot)
         things = zip(alone.touches.names, alone.touched, strict=True) if alone.touches else ()
-        places = {str(name): thing.centre for name, thing in things if not thing.planar}  # in the robot's own frame
+        places = {str(name): thing.centre for name, thing in things if not thing.planar}  # in the robot's base frame
         if not places:
             continue
         p = alone.parameters
@@ -174,20 +174,20 @@ def shared_bases(problem: CalibrationProblem) -> dict[str, Array]:
         common = {name: place for name, place in places.items() if name in known}
         free = p.identified[k].all() and all(block.touched is not None for block in alone.data.blocks)
         if free:
-            with suppress(InputError):  # too few, or on a line
+            with suppress(InputError):  # too few, or collinear
                 base = register(np.array(list(common.values())), np.array([known[name] for name in common]))
                 bases[robot] = frame_numbers(base)
         for name, place in places.items():
             there = transformed(base, place)
             distance = float(np.linalg.norm(there - known.setdefault(name, there)))
-            if (robot in bases or not free) and distance > APART:  # too few touches say nothing of a free base
+            if (robot in bases or not free) and distance > APART:  # too few touches do not contradict a free base
                 what = f"touches of '{name}' that are {distance:.2g} m from those of another robot"
                 accepted = f"at most {APART:g} m: state or identify its base, or give another point another name"
                 raise InputError(f"together, problem '{robot}'", what, accepted)
     return bases
 
 
-MISPLACED = 3.0  # how many scales a frame may be from where it is stated before the statement counts as a mistake
+MISPLACED = 3.0  # deviation of a frame from its statement, in scales, that counts as a mistake
 
 
 def problem_from(
@@ -199,14 +199,14 @@ def problem_from(
 ) -> CalibrationProblem:
     """Return the problem of a robot and its measurements, base and tool located in closed form.
 
-    The ``robot`` is the nominal one, what `read_urdf` returns, a file that describes one, or the name of a ready robot;
-    ``identify`` are patterns of names, or ``"auto"``, as for `CalibrationProblem.identify`. ``base`` (6,) is a start of
-    the base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx, or its transform (4, 4);
-    ``"auto"`` registers it; zero where the measurements do not depend on it. ``tool`` (6,) or (4, 4) is a start of the
-    reflector in the frame behind the last joint's modified-DH row, by default that of the URDF's tip, or zero, of
-    several reflectors (``marker``) the start of all, or of each by name, ``{"A": ..., "B": ...}``; one that the data
-    contradict is replaced by its registration. InputError for data of another number of joints, data that do
-    not determine where the base is, or a pattern that matches no parameter.
+    The ``robot`` is the nominal one, a result of `read_urdf`, a robot's file, or the name of a ready robot;
+    ``identify`` are patterns of names, or ``"auto"``, as for `CalibrationProblem.identify`. ``base`` is the start of
+    the base in the instrument's frame: (6,) x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx, or a transform (4, 4);
+    ``"auto"`` registers it, zero if the measurements do not depend on it. ``tool``, (6,) or (4, 4), is the start of the
+    reflector in the frame behind the last joint's modified-DH row, by default the URDF's tip, or zero; for several
+    reflectors (``marker``) the start of all, or of each by name, ``{"A": ..., "B": ...}``. A start that the data
+    contradict is replaced by registration. InputError for data with another number of joints, data that do not
+    determine the base, or a pattern without a match.
 
     >>> import rpim_opt as ro
     >>> arm = ro.load("position").problem
@@ -236,7 +236,7 @@ def problem_from(
         starts = dict.fromkeys(sorted({marker for block in data.blocks for marker in block.markers}), start)
     placed = None if isinstance(base, str) and base == "auto" else _frame(base, "base")
     if placed is None and not any(block.measurement.registers for block in data.blocks):
-        placed = np.zeros(6)  # lengths do not depend on it
+        placed = np.zeros(6)  # lengths between two points do not depend on it
     parameters = starting_parameters(robot, data, placed, starts)
     problem = CalibrationProblem(robot, parameters.identify(identifiable(identify, robot, parameters, data)), data)
     found = relocated(problem)
@@ -255,9 +255,9 @@ def _frame(value: Any, name: str) -> Array:
 
 
 FIXTURE, REFLECTOR = 1.0, 0.1
-"""How far [m, rad] a fixture and a reflector may be from where the first registration puts them."""
+"""Possible error [m, rad] of a fixture and of a reflector after the first registration."""
 TRIMMED, STEPS, GROSS = 3, 30, 5.0
-"""How often fixtures are fitted, in how many steps, and medians of the errors beyond which a row is left out then."""
+"""Repetitions of a fit of fixtures, its steps, and the error in medians beyond which a row is then left out."""
 
 
 def starting_parameters(
@@ -271,12 +271,11 @@ def starting_parameters(
 ) -> Parameters:
     """Return the model's parameters with closed-form values for what is not stated; none identified yet.
 
-    ``base`` (6,) is the robot's in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; None for registration.
-    ``tools`` are reflectors in the flange frame by marker, (6,) each as the base; ``{"": frame}`` for the only one.
-    ``own`` are values [SI] of the measurements' own parameters by name; a fixture (anchor, plane, sphere) none of whose
-    parameters is stated is located from the nominal robot. Lengths are nominal at a ``temperature`` [K], where the data
-    state temperatures; their mean by default. ``sessions`` are not among the data, where these are the first of several
-    parts.
+    ``base`` (6,) is the robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; None registers it.
+    ``tools`` are the reflectors' frames (6,) in the flange frame by marker; ``{"": frame}`` for a single one. ``own``
+    are values [SI] of the measurements' own parameters by name; a fixture (anchor, plane, sphere) without any stated
+    parameter is located with the nominal robot. Lengths are nominal at ``temperature`` [K], if the data state
+    temperatures, by default their mean. ``sessions`` are those that further parts of the data add.
 
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
@@ -295,11 +294,11 @@ def starting_parameters(
     places = tools
     if base is None:
         base, located, _ = locate(robot, with_poses(data, own), tools)
-        # a board or a camera that is turned otherwise is not visible
+        # a board or camera with another orientation is not visible
         tools = {**tools, **{block.markers[0]: located[block.markers[0]] for block in camera_blocks(data)}}
         places = {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
-    values: dict[str, tuple[str, float]] = {}  # dimensions and values [SI] of the measurements' own parameters
-    fixtures: set[str] = set()  # of these what the nominal robot locates
+    values: dict[str, tuple[str, float]] = {}  # dimension and value [SI] of the measurements' own parameters
+    fixtures: set[str] = set()  # those that the nominal robot locates
     for block in data.blocks:
         kind = block.measurement
         names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
@@ -319,10 +318,10 @@ def starting_parameters(
 
 
 def _with_fitted(robot: Robot, data: Dataset, parameters: Parameters, fixtures: Collection[str]) -> Parameters:
-    """Return parameters with fixtures at the least squares of the nominal robot, reflectors fitted beside them.
+    """Return parameters with fixtures at the least-squares fit of the nominal robot, with reflectors fitted, too.
 
-    A start that takes reflectors for known has larger errors than these, a long cable's anchor by metres. Gross
-    outliers are left out; where the data do not determine a fit, fixtures stay where they are.
+    A start with known reflectors has larger errors, of metres for a long cable's anchor. Gross outliers are left out;
+    if the data do not determine a fit, fixtures stay in place.
     """
     fitted = np.isin(parameters.names, list(fixtures))
     markers = {marker for block in data.blocks for marker in block.markers}
@@ -361,7 +360,7 @@ def relocated(problem: Source) -> Source | None:
     """Return the problem with base and reflectors registered to the data, if the stated ones contradict them."""
     p = problem.parameters
     nominal = p.nominal.copy()
-    if len(problem.arms) > 1:  # each by itself; of a frame that they share the first one's word counts
+    if len(problem.arms) > 1:  # each robot by itself; the first one determines a shared frame
         for name in problem.arms:
             alone = relocated(problem.sample().alone(name))
             if alone is not None:
@@ -397,22 +396,22 @@ def _misplaced(p: Parameters, k: np.ndarray, place: Array) -> bool:
     if not position.all() or orientation.any() != orientation.all():
         return False
     T, T0 = numeric_frame(place), numeric_frame(p.nominal[k])
-    # the deviation that takes the nominal frame there (`kinematics.frame`)
+    # the deviation from the nominal frame (`kinematics.frame`)
     deviation = np.concatenate([T[:3, 3] - T0[:3, 3], roll_pitch_yaw(T[:3, :3] @ T0[:3, :3].T)])
     far = np.abs(deviation) > MISPLACED * (p.scale[k] + NOMINAL_ERROR)
     return bool((far & p.identified[k]).any())
 
 
 def fitted_frames(problem: Source) -> tuple[Source, Array]:
-    """Return the problem that identifies frames alone, and its solution.
+    """Return the problem that identifies frames only, and its solution.
 
     ::
 
         minimize    |Sigma^-1/2 r(S z)|^2 + |z|^2
 
-    over the identified parameters of base, sessions, reflectors, anchors and the like, in units of their scales, of the
-    nominal robot. Returned are the problem of the frames (all other parameters nominal; frames that were stated far off
-    are counted from their registration) and the deviations (f,) [SI]; one without frames comes back as it is.
+    over the identified parameters of base, sessions, reflectors, anchors and other frames, in units of their scales,
+    for the nominal robot. Return the problem of the frames (other parameters nominal; frames stated far off start from
+    their registration) and the deviations (f,) [SI]; a problem without frames is returned as it is.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
@@ -432,14 +431,14 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
 def ridge_deviations(alone: Source, steps: int = 200, prior: tuple[Array, Array] | None = None) -> Array:
     """Return the deviations (n,) [SI] that minimize |A z - b|^2 + |z|^2, from nominal: a squared penalty at weight 1.
 
-    Of a ``prior`` L (k, n) and c (k,) it is |A z - b|^2 + |L z - c|^2, from the prior's minimum.
-    Levenberg-Marquardt on the QR factor of a linearization, whatever the data's number.
+    With a ``prior`` L (k, n) and c (k,) it is |A z - b|^2 + |L z - c|^2, started at the prior's minimum. The method is
+    Levenberg-Marquardt on the QR factor of a linearization, for any number of data.
     """
     source = in_parts(alone.frozen())
     scale = alone.parameters.free.scale
     L, c = prior or (np.eye(len(scale)), np.zeros(len(scale)))
     start = np.linalg.lstsq(L, c, rcond=None)[0] if prior else c
-    at: list[Array] = []  # where it was linearized last, and the factor: slopes are evaluated where residuals were
+    at: list[Array] = []  # last linearization and its factor: derivatives are evaluated at the same points as residuals
 
     def qr_factor(z: Array) -> Array:
         if not at or not np.array_equal(at[0], z):
@@ -454,5 +453,5 @@ def ridge_deviations(alone: Source, steps: int = 200, prior: tuple[Array, Array]
 
     options: Any = {"jac": slopes, "x_scale": "jac", "xtol": 1e-11, "ftol": 1e-15, "gtol": 1e-15}
     z = least_squares(residual, start, method="lm", max_nfev=steps, **options).x
-    z = z - np.linalg.lstsq(slopes(z), residual(z), rcond=None)[0]  # where a sum of squares no longer changes
+    z = z - np.linalg.lstsq(slopes(z), residual(z), rcond=None)[0]  # where the sum of squares no longer changes
     return np.asarray(scale * z, dtype=float)
