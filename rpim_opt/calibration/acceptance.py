@@ -38,12 +38,12 @@ from rpim_opt.problem.workspace import in_base, markers, within
 from rpim_opt.robot.parameters import of_session
 
 Conclusion = Literal["accepted", "rejected", "inconclusive"]
-MEASURED = 1000  # measured configurations of a block at which the uncertainty is compared with that of the region
+MEASURED = 1000  # configurations of a block whose uncertainty is compared with that of the region
 INVALID = "Missing: valid prediction intervals."
 MOST = 3  # joints or rows that a reason names
-STATED = 1e9  # degrees of freedom of an uncertainty that is stated
-WORST, BESIDE = 16, 16  # the search for the largest bound goes on from so many, at so many beside each
-STEPS = (0.1, 0.05, 0.025, 0.0125)  # how far beside, as fractions of the joint ranges
+STATED = 1e9  # degrees of freedom of a stated uncertainty
+WORST, BESIDE = 16, 16  # configurations from which the search for the largest bound goes on; neighbours tried of each
+STEPS = (0.1, 0.05, 0.025, 0.0125)  # distances of neighbours, as fractions of the joint ranges
 LEAST = 1e-9  # width of the range of a joint that never moved [rad or m]
 ANYWHERE = Requirement(limit=1.0)  # the region of a result without requirement: joints within the measured ranges
 
@@ -55,7 +55,7 @@ ANYWHERE = Requirement(limit=1.0)  # the region of a result without requirement:
 class Region:
     """Region of a requirement: a problem with its joint limits, a box (3, 2) [m] in the base frame, and a reflector.
 
-    Where only what was ``measured`` is required, these configurations (N, dof).
+    If only ``measured`` configurations (N, dof) are required, it consists of these.
     """
 
     problem: CalibrationProblem
@@ -125,7 +125,7 @@ def _measured(result: Outcome) -> Array:
 class Workspace:
     """Expanded uncertainty (N,) [m] of the positions reached (N, 3) [m] at configurations q (N, dof) of a region.
 
-    The last configuration is the worst that a search from the worst of the others found.
+    The last configuration is the worst one found by a search from the worst of the others.
     """
 
     requirement: Requirement
@@ -183,13 +183,14 @@ def reached_positions(result: Outcome, region: Region, q: Array, confidence: flo
 def distance_quantile(covariance: Array, freedom: float, probability: float) -> Array:
     """Return quantiles (N,) of the norm of Student-t vectors with scale matrices (N, k, k).
 
-    Of a normal vector with covariance S the squared length is nearly g chi^2 with h degrees of freedom (Satterthwaite),
-    ``g = tr S^2 / tr S``, ``h = (tr S)^2 / tr S^2``; a scale known to nu degrees of freedom makes it Fisher's F::
+    The squared length of a normal vector with covariance S is approximately g chi^2 with h degrees of freedom
+    (Satterthwaite), ``g = tr S^2 / tr S``, ``h = (tr S)^2 / tr S^2``; for a scale known to nu degrees of freedom
+    Fisher's F results::
 
         quantile^2 = tr S F(h, nu; probability)
 
-    That is exact where S has equal eigenvalues, or one alone, and within some per cent elsewhere; infinite where a
-    variance is.
+    This is exact if S has equal eigenvalues, or a single nonzero one, and otherwise accurate to some per cent; infinite
+    if a variance is.
     """
     trace = np.trace(covariance, axis1=1, axis2=2)
     known = np.isfinite(trace)
@@ -250,15 +251,15 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
 class Acceptance:
     """Result of the acceptance test of a calibration against a requirement.
 
-    The verdict is ``"accepted"`` where at every configuration of the region the bound is within the limit, and held-out
-    rows bear it out; ``"rejected"`` where they miss oftener than chance allows, or the robot's repeatability at its
-    least is above the limit; ``"inconclusive"`` where something is missing. ``reasons`` are sentences; empty
-    where it is accepted.
+    The verdict is ``"accepted"`` if the bound is within the limit at every configuration of the region and held-out
+    rows confirm it; ``"rejected"`` if held-out rows exceed the limit more often than chance allows, or the lower bound
+    of the robot's repeatability exceeds it; otherwise ``"inconclusive"``: something is missing. ``reasons`` are
+    sentences; empty if accepted.
 
     ``requirement`` has limit, confidence and region, ``workspace`` the expanded uncertainties at its configurations;
-    ``repeatability`` would be the largest of them if all parameters were known [m]. ``held_out`` are the errors on
-    held-out rows and the coverage of their intervals, a document [mm] with its ``sentence``. ``caution`` says how joint
-    values count, where their signs or zeros were estimated, and what was not checked.
+    ``repeatability`` [m] is the largest of them for known parameters. ``held_out`` has the errors on held-out rows and
+    the coverage of their intervals, a document [mm] with its ``sentence``. ``caution`` states how joint values count if
+    signs or zeros of joints were estimated, and what was not checked.
     """
 
     requirement: Requirement
@@ -329,17 +330,17 @@ class Acceptance:
 def accept(result: Calibration, requirement: Requirement | None = None, data: Dataset | None = None) -> Acceptance:
     """Test whether the calibrated robot meets a tolerance at every configuration of a region.
 
-    What is held against the limit is the position that the robot will reach, as `Calibration.predict` has it: with the
-    uncertainty of the parameters and the robot's repeatability, without the instrument's noise. Its distance from the
-    predicted position stays below the bound with the required confidence (`distance_quantile`); the bound is taken at
-    2048 configurations of the region, and a search goes on from the worst.
+    The limit applies to the position that the robot reaches, as in `Calibration.predict`: with the uncertainty of the
+    parameters and the robot's repeatability, without the instrument's noise. Its distance from the predicted position
+    stays below the bound with the required confidence (`distance_quantile`); the bound is computed at 2048
+    configurations of the region, and a search continues from the worst of them.
 
-    A bound is as good as its covariance. Rows that the calibration did not see check it: they have to lie in their
-    intervals, and may not miss by more than the limit oftener than chance lets them.
+    The bound relies on the covariance, which rows not used by the calibration check: they have to lie in their
+    intervals, and may not exceed the limit more often than chance allows.
 
-    The requirement and the measurements are by default those of the result's record, used since (`refit_all`) or not.
-    InputError where nothing is required, for a region that the robot has not or does not reach, and for measurements of
-    which another reading (another unit, exchanged joints) fits far better.
+    Requirement and measurements are by default those of the result's record, whether used since (`refit_all`) or not.
+    InputError without a requirement, for a region that the robot lacks or does not reach, and for measurements that
+    another interpretation (another unit, exchanged joints) fits far better.
 
     >>> import rpim_opt as ro
     >>> result = ro.load("position").calibrate()
@@ -354,7 +355,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         refuse_misread(result, data)
     limit = requirement.limit
     region = region_of(result, requirement)
-    requirement = replace(requirement, marker=region.marker)  # the first, if none of several is stated
+    requirement = replace(requirement, marker=region.marker)  # the first, if there are several and none is stated
     drawn = region.samples()
     held_out, missed, unheld = _held_out(result, region, requirement, data)
     lacking = [*_unmodelled(result, region), *unheld]
@@ -508,7 +509,7 @@ def _held_out(
 def repeatability_bounds(result: Calibration, region: Region, q: Array, confidence: float) -> tuple[float, float]:
     """Return the bounds [m] at q (dof,) if all parameters were known, for the estimated and the smallest repeatability.
 
-    Zero where it is not known apart from the noise, the smallest also where the data know no more than an upper end.
+    Zero if repeatability is not known apart from the noise; the smallest is also zero if data give only an upper bound.
     """
     results = [result]
     repeatability = result.problem.repeatability

@@ -31,8 +31,8 @@ def gauss_newton(
 ) -> Baseline:
     """Gauss-Newton: repeat least-squares steps of smallest norm until they are shorter than ``tolerance`` scales.
 
-    Weakly identifiable directions wander where noise sends them. Singular values below ``cutoff`` times the largest are
-    taken for zero: that of a redundant direction is rounding at nominal, and larger where deviations are not exact.
+    Weakly identifiable directions follow the noise. Singular values below ``cutoff`` times the largest count as zero:
+    for a redundant direction they are rounding at nominal, and larger at inexact deviations.
 
     >>> import rpim_opt as ro
     >>> ro.baselines.gauss_newton(ro.load("position").problem).iterations < 20

@@ -14,19 +14,19 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import feasibility_tolerance, pose
 from rpim_opt.problem.linear import LinearModel
 
-DECREASE = 1e-6  # what the program at a solution may still promise of the objective: an interior point's accuracy
+DECREASE = 1e-6  # relative decrease that the program at a solution may predict: an interior-point method's accuracy
 DIRECTIONS = 2  # random directions in which the model's derivative is compared
-APART = 1e-4  # half the distance of a difference, in scales
-INEXACT = 1e-4  # relative difference from which the model's derivative is not the residual's
-RESTING = 1e-12  # step, relative to 1 + |z|, below which it is rounding, whatever it promises of an objective near zero
+APART = 1e-4  # half the step of a central difference, in scales
+INEXACT = 1e-4  # relative difference above which the model's derivative is not the residual's
+RESTING = 1e-12  # step, relative to 1 + |z|, that is rounding, whatever decrease it predicts of an objective near zero
 
 
 class Certificate(NamedTuple):
     """Residuals of the optimality conditions at a solution.
 
-    ``step`` is how far the convex program at the solution would still go, relative to 1 + |z|; ``violation`` by how
-    much the constraints are missed, in units of the scales; ``decrease`` what that step promises, relative to the
-    objective, or None where it is not known.
+    ``step`` is the remaining step of the convex program at the solution, relative to 1 + |z|; ``violation`` that of the
+    constraints, in units of the scales; ``decrease`` the predicted decrease of that step, relative to the objective, or
+    None if unknown.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.bounded, weight=1e-3)
@@ -56,13 +56,13 @@ def certified(
 ) -> Certificate:
     """Return the certificate that z (n,) minimizes the nonlinear problem; the formulation's functions are called again.
 
-    ``model`` is the problem linearized at z, anew; ``floor`` the objective below which one has vanished. Where
-    ``residual`` gives the whitened residual b - A z at z (n,), the model's derivative is compared with its differences,
-    and replaced by them where it is not theirs.
+    ``model`` is the problem linearized again at z; ``floor`` is the objective below which it counts as zero. If
+    ``residual`` is given (the whitened residual b - A z as a function of z (n,)), the model's derivative is compared
+    with finite differences, and replaced by them if it differs.
     """
     if residual is not None:
         model = _differentiated(model, residual, z)
-    program = pose(formulation, model).beginning(z)  # where a minimum is looked for first proves nothing
+    program = pose(formulation, model).beginning(z)  # the start of the search proves nothing
     objective = program.objective(z, weight)
     violation = program.violation(z)
     try:

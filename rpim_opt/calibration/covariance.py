@@ -19,17 +19,17 @@ from rpim_opt.problem.multi_robot import unknown_sessions
 from rpim_opt.problem.problem import CalibrationProblem
 
 Interval = Literal["mean", "reached", "reading"]
-UNDECIDED = 1e-9  # a position depends on an undecided direction that makes more than this share of its movement
+UNDECIDED = 1e-9  # share of a position's movement by an undetermined direction above which the position is undetermined
 
 
 @dataclass(frozen=True, eq=False)
 class FitCovariance:
     """Covariance of a least-squares fit with a quadratic penalty, noise and prior separately (see `Uncertainty`).
 
-    ``linear``, ``form`` and ``weight`` are the equations that the fit rests on, their closed form with the penalty, and
-    its weight; ``z`` (n,) the solution in units of the scales. ``level`` is the noise's variance in units of the
-    equations', where it was estimated with the repeatability, ``drift`` (n, k) what estimated hyperparameters and heavy
-    tails add: D with D D' a covariance of the deviations [SI].
+    ``linear``, ``form`` and ``weight`` are the equations of the fit, their closed form with the penalty, and its
+    weight; ``z`` (n,) is the solution in units of the scales. ``level`` is the noise's variance in units of the
+    equations', if it was estimated with the repeatability. ``drift`` (n, k) is D, where D D' [SI] is the covariance
+    added by estimated hyperparameters and heavy tails.
     """
 
     linear: LinearModel
@@ -86,12 +86,12 @@ class FitCovariance:
     def of_positions(self, J: Array) -> Array:
         """Return the covariances (N, 3, 3) [m^2] of positions with derivatives J (N, 3, n) by the deviations [SI].
 
-        Variances are infinite where an undecided direction moves the position; where none does they are finite, even
-        if no parameter alone is known.
+        Variances are infinite if an undetermined direction moves the position; otherwise they are finite, even if no
+        single parameter is determined.
         """
         covariance = J @ (self.noise + self.prior) @ J.transpose(0, 2, 1)
         variances = np.einsum("nkk->nk", covariance)
-        np.maximum(variances, 0.0, out=variances)  # along what a constraint fixes rounding is left
+        np.maximum(variances, 0.0, out=variances)  # along directions fixed by constraints only rounding is left
         slopes = J * self.linear.parameters.scale
         moved = np.linalg.norm(slopes @ self.form.undetermined(self.weight), axis=2)
         size = np.linalg.norm(slopes, axis=(1, 2))
@@ -103,8 +103,8 @@ class FitCovariance:
 class NoiseCovariances(NamedTuple):
     """Covariances added to that of the rows' model, block by block (N, k, k) [SI].
 
-    ``robot`` is the robot's repeatability, ``reading`` this and the instrument's noise, with ``session``, the offset of
-    a session that the problem does not know.
+    ``robot`` is the robot's repeatability, ``reading`` adds the instrument's noise and ``session``, the offset of a
+    session that the problem does not know.
     """
 
     robot: list[Array]
@@ -115,7 +115,7 @@ class NoiseCovariances(NamedTuple):
 def noise_covariances(problem: CalibrationProblem, level: float) -> NoiseCovariances:
     """Return the covariances that robot and instrument add to the model of some measurements.
 
-    Where repeatability was not estimated, the robot's is what residuals show beyond the stated noise: (level - 1)
+    If repeatability was not estimated, the robot's part is the excess of residuals over the stated noise, (level - 1)
     Sigma, with ``level`` the noise's variance over the stated one, at least 1.
     """
     session = unknown_sessions(problem)
@@ -146,9 +146,9 @@ def coverage_factor(dof: float | Array, confidence: float) -> Array:
 def row_dof(dof: float, log_std: float, whole: Array, session: Array) -> Array:
     """Return the degrees of freedom (N,) of the rows' variances, at least one; few sessions reduce them.
 
-    2 V^2 / var(V) of the sum V of both parts' variances (Satterthwaite), with ``dof`` that of what no session adds,
-    ``log_std`` the standard deviation of the logarithm of the session offsets' size, and covariances (N, k, k) of a row
-    and of what an unknown session adds to it.
+    2 V^2 / var(V) of the sum V of both parts' variances (Satterthwaite), with ``dof`` those of the part without
+    session, ``log_std`` the standard deviation of the logarithm of the session offsets' scale, and covariances (N, k,
+    k) of a row and of the part by an unknown session.
     """
     dof = max(dof, 1.0)
     V = np.einsum("nkk->n", whole)

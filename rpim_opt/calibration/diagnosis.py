@@ -17,8 +17,8 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier
 from rpim_opt.problem.blocks import Source
 
-SLACK = 0.1  # share of a measured joint range by which values may exceed it: its extremes are drawn by chance
-SLACK_LEAST = np.radians(1.0)  # what they may exceed it by in any case [rad; for prismatic joints 17 mm]
+SLACK = 0.1  # share of a measured joint range by which values may exceed it, since its extremes are random
+SLACK_LEAST = np.radians(1.0)  # least such excess [rad; for prismatic joints 17 mm]
 
 
 class Flag(NamedTuple):
@@ -40,11 +40,11 @@ class ActiveBound(NamedTuple):
 
 
 class ShadowPrice(NamedTuple):
-    """A constraint that is written as text, at a solution: its shadow price or its slack.
+    """Shadow price or slack of a constraint that is written as text, at a solution.
 
-    ``slack`` is its distance from the limit, in ``unit``; ``multiplier`` the decrease of the objective (loss + weight
-    penalty) per ``unit`` of loosening, zero if it is inactive; ``gain`` the decrease for loosening it by ``step``, to
-    first order. ``misfit`` is the objective itself.
+    ``slack`` is the distance from its limit, in ``unit``; ``multiplier`` the decrease of the objective (loss + weight
+    penalty) per ``unit`` of loosening, zero if inactive; ``gain`` the decrease for loosening by ``step``, to first
+    order. ``misfit`` is the objective itself.
     """
 
     text: str

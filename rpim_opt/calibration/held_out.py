@@ -20,12 +20,12 @@ from rpim_opt.problem.causes.rows import common_rows
 from rpim_opt.problem.registration.closed_forms import register, transformed
 from rpim_opt.robot.parameters import Parameters, of_session, session_prefix
 
-FEWEST = 5  # held-out rows below which they are too few to judge
+FEWEST = 5  # fewer held-out rows are too few for a judgement
 CHANGED = (
     "If the robot changed, recalibrate by `update`, which names the change; otherwise repeat these measurements, or "
     "extend the model."
 )
-GROSS = 6.0  # factor on the median distance from which on a row does not count for a registration
+GROSS = 6.0  # factor on the median distance beyond which a row is excluded from a registration
 
 
 def rows_used(result: Calibration, data: Dataset) -> dict[str, str]:
@@ -50,9 +50,9 @@ def registration(free: Parameters, data: Dataset) -> str:
 def displacement(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
     """Return sentences on a common displacement of the measurements, by registration: as mistake or as remark.
 
-    It is reported where rows are outside their prediction intervals, or contradict them together. A mistake is a motion
-    that takes more than half of the RMS error, for its six degrees of freedom, of rows that are outside; a remark one
-    whose part of the squared errors chance would give with probability 0.01 (Fisher's F). Both are empty otherwise.
+    It is reported if rows are outside their prediction intervals, or contradict them together. It is a mistake if a
+    motion, with its six degrees of freedom, removes more than half of the RMS error of rows outside their intervals; a
+    remark, if its part of the squared errors has p-value below 0.01 (Fisher's F). Otherwise both are empty.
     """
     vectors = result.error_vectors(data)
     rows = np.flatnonzero(np.isfinite(vectors).all(axis=1))
@@ -61,7 +61,7 @@ def displacement(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str
         return "", ""
     try:
         again, motion = registered(result, data)
-    except InputError:  # points on a line
+    except InputError:  # collinear points
         return "", ""
     squares, left = (float(np.sum(each[rows] ** 2)) for each in (vectors, result.error_vectors(again)))
     freedom = 3 * len(rows) - 6
@@ -71,7 +71,7 @@ def displacement(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str
         f"{1e3 * before:.3g} mm."
     )
     place = registration(result.problem.parameters.free, data)
-    again = f" --reset '{place}*'" * (place == "base_")  # a new session is registered by itself
+    again = f" --reset '{place}*'" * (place == "base_")  # a new session has its own registration
     if far and after <= before / 2:
         return (
             f"{said} If the instrument or the base moved, use --register in `validate`, `monitor` and `accept`, or "
@@ -86,10 +86,10 @@ def displacement(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str
 def registered(result: Calibration, data: Dataset, mine: np.ndarray | None = None) -> tuple[Dataset, str]:
     """Return measurements after the motion of the instrument that registers them best, and that motion in words.
 
-    Positions, poses and their covariances turn, lengths stay, and so do rows that are not ``mine`` (N,). The motion
-    takes six degrees of freedom; rows beyond six times the median distance do not count for it. InputError for rows of
-    the identification data, which are in the calibration's frame and would not be recognized after a motion; for fewer
-    than three positions; points on a line.
+    Positions, poses and their covariances move; lengths do not, nor do rows that are not ``mine`` (N,). The motion has
+    six degrees of freedom, and ignores rows beyond six times the median distance. InputError for rows of the
+    identification data (they are in the calibration's frame, and could not be recognized after a motion), for fewer
+    than three positions, and for collinear points.
     """
     mine = np.full(len(data), True) if mine is None else mine
     if used := rows_used(result, data):
@@ -133,8 +133,8 @@ def refit_all(result: Calibration) -> Calibration:
     """Return the calibration from identification and validation rows together, with the same settings.
 
     Errors on the held-out rows, which validate the procedure, stay in its record (``held_out``); the parameters come
-    from all rows. No row is left that checks these alone. The held-out rows are the record's. InputError where there
-    are none, or measurements are not in memory.
+    from all rows, and no row is left to check them. The held-out rows are the record's. InputError if there are none,
+    or if measurements are not in memory.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
@@ -154,7 +154,7 @@ def refit_all(result: Calibration) -> Calibration:
     labels = whole.label[len(original.data) :]
     held = replace(held_out_errors(result, apart, np.isin(labels, refitted.problem.labels)), label=labels)
     record = replace(result.record, validation=None, held_out=held)
-    if refitted.learned is not None and result.learned is not None:  # rows that were excluded stay so, and are named
+    if refitted.learned is not None and result.learned is not None:  # excluded rows stay excluded, and are named
         left_out = (*result.learned.left_out, *refitted.learned.left_out)
         refitted = replace(refitted, learned=replace(refitted.learned, left_out=left_out))
     excluded = [rows for rows in (result.excluded, refitted.excluded) if rows is not None]

@@ -39,16 +39,16 @@ NOISE = {
     "level": ("instrument",),
     "declared": (),
 }
-"""Components of the noise that are estimated, by the option's name."""
+"""Estimated components of the noise, by the option's name."""
 MODELS = {"geometry": ("position", "orientation", "instrument"), "auto": NOISE["free"]}
-"""Components of the noise by model: without extensions the deflection under gravity would count as joint noise."""
-LEVEL = 1e-9  # relative fall of the objective over five iterations below which it hardly changes
+"""Components of the noise by model: without extensions, deflection under gravity would count as joint noise."""
+LEVEL = 1e-9  # relative decrease of the objective over five iterations that is no progress
 DIVERGES = "poorly identifiable combinations diverge without a penalty; add one."
 DIVERGES_PENALIZED = (
     "combinations that neither data nor penalty determines diverge; use a larger weight, or penalize all parameters."
 )
 DISPLACED = "Deviations refer to registered frames"
-ZERO = 0.1  # standard deviation [rad] of a joint's zero that was found from the data
+ZERO = 0.1  # standard deviation [rad] of a joint zero found from the data
 
 
 @one_blas_thread
@@ -85,44 +85,44 @@ def calibrate(
     Parameters
     ----------
     problem
-        The measurements, and the parameters to identify. ``ro.calibrate`` takes an instance of `load` as well, or the
-        name or folder that it loads: what is not stated here is then as its file has it.
+        The measurements, and the parameters to identify. ``ro.calibrate`` also takes an instance of `load`, or its name
+        or folder: arguments that are not given here are then those of its file.
     formulation
         Loss, penalty and constraints, or the name of a ready one (``"robust"``); its functions are called again.
     weight
-        None or ``"learned"``: hyperparameters are estimated. A number, or a selection rule (or its name) over the
-        stated scales, which uses identification data only; it is applied again at the solution, and its weight is
-        final if it is the same. Weights of single groups of parameters are scales: ``Prior(scale={"a?_mm": 0.5})``.
+        None or ``"learned"`` estimates hyperparameters. A number, or a selection rule (or its name), holds for the
+        stated scales; a rule uses identification data only, is applied again at the solution, and its weight is final
+        if unchanged. Weights of single groups of parameters are scales: ``Prior(scale={"a?_mm": 0.5})``.
     prior
-        Of the deviations, beyond the scales of the parameters.
+        Prior of the deviations, in addition to the scales of the parameters.
     model
         ``"geometry"``, or ``"auto"``: model extensions (compliance under gravity, gear eccentricity, ...) are added
-        where the evidence supports them.
+        if the marginal likelihood supports them.
     noise
-        What ``"learned"`` weights estimate of it: ``"robot"``, the robot's repeatability beside the stated measurement
-        noise; ``"free"``, the measurement noise too; ``"level"``, one factor on the stated noise; ``"declared"``,
-        nothing. With another weight uncertainties follow the residuals where these are significantly larger.
+        Noise that is estimated with ``"learned"``: ``"robot"``, the robot's repeatability in addition to the stated
+        measurement noise; ``"free"``, also the measurement noise; ``"level"``, one factor on the stated noise;
+        ``"declared"``, none. With another weight uncertainties follow the residuals if these are significantly larger.
     start
-        (n,) deviations [SI] to begin with; nominal by default. Then signs and zeros of joints are sought where the
-        nominal robot does not explain the data (`global_start`), and frames that are stated metres or half a turn from
-        their registration start there (`frames.relocated`), but for what the prior knows. The result does not depend on
-        a stated start, as long as the loop converges.
+        (n,) deviations [SI] to start from; nominal by default. Without it, signs and zeros of joints are sought if the
+        nominal robot does not explain the data (`global_start`), and frames stated metres or half a turn from their
+        registration start there (`frames.relocated`), unless the prior states them. If the loop converges, the result
+        does not depend on a stated start.
     max_iterations, tolerance
-        When to stop: linearizations, and length of a step. ``converged`` and ``message``
-        of the result report how the loop ended.
+        Stopping criteria: number of linearizations, and length of a step. ``converged`` and ``message`` of the result
+        report how the loop ended.
     progress
-        Called after every iteration, which the logger ``rpim_opt`` reports at level INFO, too.
+        Called after every iteration; the logger ``rpim_opt`` also reports it at level INFO.
     solver, settings, verbose
-        Any installed solver of CVXPY, with its options (`Program.solve`), for the steps of the calibration; rules and
-        hyperparameters solve as without.
+        An installed solver of CVXPY with its options (`Program.solve`), for the steps of the calibration; rules and
+        hyperparameters do not use it.
 
     Raises
     ------
     InputError
-        For fewer equations than unknowns without a penalty, a start that does not fit, unknown words, and sessions by
-        the hundred, of which it says what they would cost.
+        For fewer equations than unknowns without a penalty, a start that does not fit, unknown names, and so many
+        sessions that identifying them takes too long (it states how long).
     NoSolutionFound
-        When a convex program fails.
+        If a convex program has no solution.
 
     Examples
     --------
@@ -165,7 +165,7 @@ def calibrate(
         noise=noise,
         **(vars(options) | {"progress": None}),
     )
-    if applied is None and formulation.penalty is None:  # statements have standard deviations
+    if applied is None and formulation.penalty is None:  # such statements need standard deviations
         applied = 1.0 if prior is not None and prior.statements else 0.0
     estimator = Estimator(prior or Prior(), kinds, nearby)
     learned = None

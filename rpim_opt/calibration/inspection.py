@@ -32,12 +32,12 @@ from rpim_opt.problem.row_functions import repeated
 class Inspection(Tabled):
     """Result of `inspect`.
 
-    ``residual`` (N,) is the error of every row of the ``problem`` [m], robot nominal, identified frames fitted;
-    ``repeated`` are groups of labels measured in the same configuration by the same reflector. ``warnings`` (limits,
-    coverage, copied values, axes that are nearly parallel) and ``contact`` (what touches show) are
-    sentences; ``observability`` is what the configurations can show. ``fit`` is a quick fit, a calibration of the
-    geometry with estimated scales and noise, and ``lack_of_fit`` the components of its residuals, repeatability among
-    them; None where there is no solution.
+    ``residual`` (N,) is the error of every row of the ``problem`` [m] with the nominal robot and identified frames
+    fitted; ``repeated`` are groups of labels measured in the same configuration with the same reflector. ``warnings``
+    (limits, coverage, copied values, nearly parallel axes) and ``contact`` (information in touches) are sentences;
+    ``observability`` is what the configurations can identify. ``fit`` is a quick calibration of the geometry with
+    estimated scales and noise, and ``lack_of_fit`` the components of its residuals, repeatability among them; both None
+    if there is no solution.
 
     >>> import rpim_opt as ro
     >>> found = ro.calibration.inspect(ro.load("paper_arm", variant="misprints").problem)
@@ -173,9 +173,8 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None, prio
     """Check a problem's data: ranges, coverage, repeated rows, likely input mistakes, identifiability.
 
     Mistakes are units, signs, zeros, orders and couplings of joints, rows that are shifted, exchanged or have no value,
-    left-handed frames, another robot, an instrument that moved. They are named by a quick fit, with the ``prior``, as
-    `likely_causes` names those of any calibration; of the rows that were kept apart for ``validation`` none should be
-    an identification row.
+    left-handed frames, another robot, an instrument that moved. They are sought with a quick fit, with the ``prior``,
+    as by `likely_causes` for any calibration; none of the rows for ``validation`` should also be an identification row.
 
     >>> from dataclasses import replace
     >>> import rpim_opt as ro
@@ -202,7 +201,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None, prio
     except (InputError, NoSolutionFound, np.linalg.LinAlgError) as error:
         failed = [f"The quick fit has no result: {error}"]
         failed += [f"Likely: {text}" for text in better_interpretations(problem)]
-    # all are identified again, with frames where they were fitted
+    # all are identified again, with frames if those were fitted
     whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
     return Inspection(
         problem=problem,

@@ -22,14 +22,14 @@ from rpim_opt.problem.noise import UNITS, Repeatability, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import about_means, measured_torques, repeated
 
-FEWEST = 6  # equations that must be left over, or repeated, to judge by
-CORRELATED = 4.0  # z-score from which on residuals are said to be autocorrelated
-ROUGH, FINE = 2.0, 0.3  # repeatability over noise above which the robot is the limit, below which the instrument is
-GROSS = 300.0  # repeatability over measurement noise above which data are wrong
-NEGLIGIBLE = 0.1  # parts below this share of a larger one are not worth a word
+FEWEST = 6  # least number of redundant equations, or repetitions, for a judgement
+CORRELATED = 4.0  # z-score from which residuals are called autocorrelated
+ROUGH, FINE = 2.0, 0.3  # repeatability over noise: above, the robot limits accuracy; below, the instrument does
+GROSS = 300.0  # repeatability over measurement noise that means wrong data
+NEGLIGIBLE = 0.1  # parts below this share of a larger one are not reported
 RARE = 1e-3  # probability that residuals exceed the standard deviation of repeated readings by chance
-PERMUTATIONS = 300  # permutations that an autocorrelation is compared with
-FEWEST_NEIGHBOURS = 8  # configurations below which there is no autocorrelation
+PERMUTATIONS = 300  # permutations for the distribution of an autocorrelation
+FEWEST_NEIGHBOURS = 8  # least number of configurations for an autocorrelation
 TOGETHER = (
     "An update keeps the model: calibrate all tables together (`rpim-opt new FOLDER --data OLD --data NEW ...`, then "
     "`calibrate`)."
@@ -39,7 +39,7 @@ TOGETHER = (
 class Extension(NamedTuple):
     """A model extension: its parameter patterns, its name, a sentence on its effect, and its terms.
 
-    Terms whose evidence is asked for at a result; first moments of links are gravity's, as either stands for the other.
+    The terms are tried at a result; first moments of links belong to gravity, since either can represent the other.
     """
 
     identify: tuple[str, ...]
@@ -83,16 +83,16 @@ class Autocorrelation(NamedTuple):
 class LackOfFit:
     """Components of a calibration's residuals, as RMS of vectors over the rows [m; rad or px without lengths].
 
-    ``residual_dof`` are residual degrees of freedom of the ``equations``; below 6 there is no more. ``residual`` is the
-    RMS of the errors; ``instrument`` (as stated or estimated), ``position`` (the robot's repeatability in position,
-    without lengths in orientation) and ``joint`` are the noise's parts, ``repeatable`` is what the extensions
-    ``missing`` would explain: a ``share`` of the mean square residual, -2 ln L falling by ``gain``; ``parameters`` are
-    the patterns that identify them. ``present`` says by how much -2 ln L falls with each extension of the model.
-    ``autocorrelation`` is that of the residuals with all that is missing, None for too few; ``upward`` are joints
-    whose compliance is significantly negative, which gravity cannot do. ``repeated`` is the RMS of repeated readings
-    about their mean, None without enough, ``excess`` that of the residuals beyond, where it is more than chance.
-    ``overstated``: the residuals are smaller than the stated noise, by the chi-squared test (`NoiseTest`);
-    ``updated``: an earlier calibration is the prior, whose model they were not compared for.
+    ``residual_dof`` are residual degrees of freedom of the ``equations``; below 6 nothing else is known. ``residual``
+    is the RMS of the errors; parts of the noise are ``instrument`` (stated or estimated), ``position`` (the robot's
+    repeatability in position, without lengths in orientation) and ``joint``; ``repeatable`` is what the extensions
+    ``missing`` would explain: a ``share`` of the mean squared residual, with -2 ln L falling by ``gain``;
+    ``parameters`` are the patterns that identify them. ``present`` is the decrease of -2 ln L by each extension of the
+    model. ``autocorrelation`` is that of the residuals with all missing effects, None for too few rows; ``upward`` are
+    joints with a significantly negative compliance, which gravity cannot cause. ``repeated`` is the RMS of repeated
+    readings about their mean, None without enough; ``excess`` that of the residuals beyond it, if significant.
+    ``overstated`` means that residuals are smaller than the stated noise, by the chi-squared test (`NoiseTest`);
+    ``updated`` that an earlier calibration is the prior, and extensions were not tried.
     """
 
     configurations: int
@@ -185,8 +185,8 @@ class LackOfFit:
 def lack_of_fit(result: Outcome) -> LackOfFit:
     """Return the components of a calibration's residuals.
 
-    The evidence of model extensions is computed at the linearization of the result, whatever its weight; of large data
-    at most 1000 configurations are looked at, and outlying rows are left out.
+    The evidence of model extensions is computed at the linearization of the result, whatever its weight, from at most
+    1000 configurations and without outlying rows.
     """
     compared = Comparison(result)
     problem, dimension = compared.problem, compared.dimension
@@ -200,7 +200,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     if compared.residual_dof < FEWEST:
         return LackOfFit(**known)
     best = compared.best
-    # an update keeps the repeatability of the calibration before it, which few new readings do not tell
+    # an update keeps the repeatability of the earlier calibration, which few new readings do not determine
     kept = result.problem.repeatability if result.record.earlier and not best.extensions else None
     after = _parts(compared, best, kept)
     known |= after
@@ -262,7 +262,7 @@ def _parts(compared: Comparison, model: Candidate, known: Repeatability | None =
 def _upward(compared: Comparison, present: Mapping[str, float]) -> tuple[str, ...]:
     """Return the joints that surely turn against gravity, where gravity is worth its parameters."""
     model = compared.best
-    # signs of measured torques are the table's, and numbers of joints would not say of which robot
+    # signs of measured torques are the table's; numbers of joints would be ambiguous
     if measured_torques(compared.problem.data) or len(compared.problem.arms) > 1:
         return ()
     if "gravity" not in {*model.extensions, *present}:
@@ -313,9 +313,9 @@ def autocorrelation(q: Array, errors: Array, kinds: np.ndarray) -> Autocorrelati
 
         rho = sum_i e_i . e_nearest(i) / sum_i e_i . e_i
 
-    and z = (rho - mean) / std over permutations of the residuals; two that are each other's nearest count twice in
-    both. With N joint values (N, dof), residuals (N, k) in units of their noise, and kinds (N,) among which neighbours
-    are sought. None for fewer than `FEWEST_NEIGHBOURS` of the same kind.
+    and z = (rho - mean) / std over permutations of the residuals; mutual nearest neighbours count twice in both. ``q``
+    (N, dof) are joint values, ``errors`` (N, k) residuals in units of their noise, and neighbours are sought among rows
+    of the same of the ``kinds`` (N,). None for fewer than `FEWEST_NEIGHBOURS` rows of every kind.
     """
     unit = (q - q.mean(axis=0)) / (q.std(axis=0) + 1e-9)
     groups = [rows for kind in np.unique(kinds) if len(rows := np.flatnonzero(kinds == kind)) >= FEWEST_NEIGHBOURS]
@@ -328,7 +328,7 @@ def autocorrelation(q: Array, errors: Array, kinds: np.ndarray) -> Autocorrelati
     for rows in groups:
         e = errors[rows]
         near = scipy.spatial.KDTree(unit[rows]).query(unit[rows], k=2)[1]
-        # of points at the same place either may come first
+        # points at the same place may come in any order
         nearest = np.where(near[:, 0] == np.arange(len(rows)), near[:, 1], near[:, 0])
         product += float(np.sum(e * e[nearest]))
         products = e @ e.T

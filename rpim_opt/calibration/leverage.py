@@ -22,9 +22,9 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import bounding, moved, predicted
 from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
 
-ALONE = 1e-9  # a configuration decides a direction alone where others know less than this share of it
-UNIDENTIFIABLE = 1e-9  # standard deviations below, in scales, are rounding: the data do not see the parameter
-IMPROVED = 0.9  # a calibration whose predicted error is above this share of the nominal robot's improves nothing
+ALONE = 1e-9  # share of a direction known without a configuration, below which that configuration alone determines it
+UNIDENTIFIABLE = 1e-9  # smaller standard deviations, in scales, are rounding: the parameter is unidentifiable
+IMPROVED = 0.9  # ratio of predicted to nominal error above which a calibration is no improvement
 BALANCED = 1e-4  # gradient of weighted equations and penalty at the solution, relative to that of the data at nominal
 
 
@@ -32,13 +32,13 @@ BALANCED = 1e-4  # gradient of weighted equations and penalty at the solution, r
 class Influence(Tabled):
     """Influence of C configurations on n parameters.
 
-    ``label`` and ``configuration`` (C,) are of their first rows, ``parameters`` and ``dimensions`` of the parameters.
-    ``leverage`` (C,) is the trace of a configuration's part of the influence matrix; they sum to the degrees of freedom
-    of the fit. ``cook`` (C,) is Cook's distance (1977): how far all predictions move without the configuration, in
-    units of the noise and a degree of freedom; the result hangs on one of about 1. ``change`` (C, n) is by how much
-    parameters would change [SI], NaN where no other configuration decides one; ``deviation`` (n,) their standard
-    deviations from the noise [SI], zero where the data do not see one; ``weight`` (C,) what a robust loss gave the
-    configuration at the end, against a squared one.
+    ``label`` and ``configuration`` (C,) are those of their first rows, ``parameters`` and ``dimensions`` of the
+    parameters. ``leverage`` (C,) is the trace of a configuration's block of the influence matrix; its sum is the fit's
+    degrees of freedom. ``cook`` (C,) is Cook's distance (1977): the change of all predictions without the
+    configuration, in units of the noise and per degree of freedom; about 1 means that the result depends on it.
+    ``change`` (C, n) are the changes of the parameters [SI], NaN if no other configuration determines one;
+    ``deviation`` (n,) their standard deviations from the noise [SI], zero for unidentifiable ones; ``weight`` (C,) the
+    final weight of the configuration in a robust loss, relative to a squared one.
     """
 
     label: tuple[str, ...]
@@ -67,7 +67,7 @@ class Influence(Tabled):
         return rows
 
 
-@one_blas_thread  # small matrices: threads would wait for each other longer than they compute
+@one_blas_thread  # small matrices: several threads would wait more than compute
 def influence(result: Outcome) -> Influence:
     """Return the change of every parameter when one configuration is left out.
 
@@ -76,11 +76,11 @@ def influence(result: Outcome) -> Influence:
 
         z_-k - z = H^-1 A_k' (I - A_k H^-1 A_k')^-1 r_k
 
-    which is exact for the last linearization at the same weight, and costs one pass over the equations for all of
-    them. With a robust loss W are the weights with which the loss ended; they are held, so that what is left out
-    changes no other configuration's weight. Parameters at a bound stay there.
+    which is exact for the last linearization at the same weight, and needs one pass over the equations for all of them.
+    With a robust loss, W are its final weights; they are held fixed, so that omitting a configuration changes no other
+    weight. Parameters at a bound stay there.
 
-    InputError for a penalty that is no square, and a loss that weighs no equations (minimax rests on a few).
+    InputError for a penalty that is not quadratic, and a loss without weights of equations (minimax depends on a few).
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -95,7 +95,7 @@ def influence(result: Outcome) -> Influence:
     numbers, which, equations = np.unique(model.group, return_inverse=True, return_counts=True)
     squares = (model.A @ result.z - model.b) ** 2
     formulation = result.formulation
-    if not result.squared_loss:  # squares with the weights that the loss ended with
+    if not result.squared_loss:  # squares with the final weights of the loss
         model, _ = QuadraticModel(formulation.loss, formulation.name, formulation.loss_over)(model, result.z)
     A, b = model.qr_factor[:, :-1], model.qr_factor[:, -1]
     L, c = np.zeros((0, len(free))), np.zeros(0)
@@ -165,8 +165,8 @@ def _left_out(Q: Array, residual: Array, equations: np.ndarray) -> tuple[Array, 
 class Improvement:
     """Expected position errors of the flange [m] over the joint ranges, with base and tool fitted.
 
-    RMS before (nominal parameters) and after (identified ones); ``within`` is what 95 % of the errors along any axis do
-    not exceed where least is known.
+    RMS ``before`` (nominal parameters) and ``after`` (identified ones); ``within`` is the limit of 95 % of the errors
+    along any axis, at the least determined configuration.
     """
 
     before: float
@@ -182,14 +182,14 @@ class Improvement:
 def improvement(result: Outcome) -> Improvement | None:
     """Return the expected position errors of the flange, nominal and identified; None if undetermined.
 
-    With the deviations x, D their slopes of W positions over the joint ranges less what fitting base and tool anew
-    takes back, N the covariance of x by noise and B the mean square of what the penalty holds back::
+    With the deviations x, their derivatives D of W positions over the joint ranges, less the part that fitting base and
+    tool removes, N the covariance of x by noise and B the mean square of the penalty's bias::
 
         after^2  = tr(D (N + B) D') / W
         before^2 = (|D x|^2 - tr(D N D') + tr(D B D')) / W
 
-    N is that of leaving out every configuration in turn (the jackknife) where that exceeds what noise predicts: then
-    the rows of a configuration err together, by the robot or by the camera, and more of them do not help.
+    N is the jackknife's, from leaving out every configuration in turn, if that exceeds the noise's prediction: rows of
+    a configuration then have common errors, of robot or camera, and more of them do not help.
 
     For a squared penalty or none, and one robot with joint limits.
 

@@ -21,34 +21,34 @@ from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem, around
 
-GAIN_GOOD, GAIN_POOR = 0.75, 0.25  # actual over predicted decrease above which damping shrinks, below which it grows
+GAIN_GOOD, GAIN_POOR = 0.75, 0.25  # actual over predicted decrease: above, damping shrinks; below, it grows
 DAMPING_GROWTH, DAMPING_SHRINK, DAMPING_FIRST, DAMPING_LEAST = 4.0, 0.5, 1.0, 1e-4
 """Factors; the first damping term over the predicted decrease; the ratio below which it is dropped."""
 CURVATURE, CURVATURE_STEP, CURVATURE_TURN = 0.1, 0.1, 0.75
-"""Curvature over the step's effect from which a step follows it; share of the step at which it is measured; the most
-that it may turn the step."""
-NEGLIGIBLE_STEP = 1e-3  # steps shorter than this share of the solution have an acceleration of rounding alone
+"""Relative curvature from which a step follows it; share of the step at which it is measured; largest turn of the
+step."""
+NEGLIGIBLE_STEP = 1e-3  # for shorter steps, relative to the solution, acceleration is rounding
 EXACT, INTERIOR, BEST = 1e-12, 1e-8, 1e-11
-"""Relative accuracy of an objective: of formulas and active sets, of interior points, and of these at their best."""
-VANISHING = 1e-12  # share of the first objective below which one has vanished: noise-free data end at rounding
-ROUNDING = 1e-9  # relative rise of an objective at a step that is rounding
-FEW_ITERATIONS = 10  # iterations that are too few to begin with a weight that no rule was asked for
-NEAR_FIRST = 0.01  # share of the solution that the next step at the first weight may be when the rule is asked
+"""Relative accuracy of an objective: by formulas and active sets, by interior-point methods, and by these at best."""
+VANISHING = 1e-12  # share of the first objective that counts as zero: noise-free data end at rounding
+ROUNDING = 1e-9  # relative increase of an objective by a step that is rounding
+FEW_ITERATIONS = 10  # largest number of iterations at the first weight before a rule is asked
+NEAR_FIRST = 0.01  # next step at the first weight, relative to the solution, at which the rule is asked
 STALLED, STALLED_MOST = 2, 20
-"""Evaluations in a row that do not lower the objective beyond its accuracy, after which the loop is at rest: where the
-next step promises nothing, and whatever that promises."""
+"""Evaluations in a row without decrease beyond accuracy, after which the loop ends: if the next step predicts none, and
+in any case."""
 FAR, FAR_ITERATIONS = 1000.0, 250
-"""Deviations in prior standard deviations beyond which a fit is called divergent; iterations after which it is given
-up there: combinations that neither data nor penalty hold lead on and on."""
+"""Deviations in prior standard deviations that count as divergence, and the iterations after which the loop then ends:
+combinations that neither data nor penalty determine would drift on."""
 DAMPING_MOST = 1e30  # damping at which no step, however short, lowers the objective
-SAME_POSITIONS = 1e-4  # what a round may change, relative to 1 + |z|: the error of predicted positions is its square
-ROUNDS, LEAST_SHARE = 20, 1 / 8  # rounds at most; least share of the way to its solution at which the next linearizes
-ROUGH_TOLERANCE = 1e-3  # tolerance of fits between two estimates of hyperparameters: the last fit is exact
-SETTLED = 1e-3  # the weight is chosen anew while a step is longer than this share of the solution, then stays
-SAME = 0.01  # two weights are the same when their logarithms differ by no more
-SAME_SEARCH = float(np.log(SAME_WEIGHT))  # the same of weights from a search
-SAME_ROBUST = 1e-6  # the same of a robust loss, whose weight does not depend on how the measurements are stored
-MOST_CHOICES = 10  # how many different weights a rule may choose in turn
+SAME_POSITIONS = 1e-4  # last change, relative to 1 + |z|, of a round: the error of predicted positions is its square
+ROUNDS, LEAST_SHARE = 20, 1 / 8  # most rounds; least share of the way to its solution for the next linearization point
+ROUGH_TOLERANCE = 1e-3  # tolerance of fits between two estimates of hyperparameters: only the last fit is exact
+SETTLED = 1e-3  # the weight is selected again while a step is longer than this share of the solution, then kept
+SAME = 0.01  # difference of logarithms up to which two weights are equal
+SAME_SEARCH = float(np.log(SAME_WEIGHT))  # the same for weights from a search
+SAME_ROBUST = 1e-6  # the same for a robust loss, whose weight does not depend on the storage of measurements
+MOST_CHOICES = 10  # most different weights that a rule may select in turn
 
 
 @dataclass(frozen=True)
@@ -90,13 +90,13 @@ class Options:
 class WeightChoice:
     """The weight of an iteration, and how it was chosen.
 
-    A rule is applied (`updated`) at every point until steps are short where solutions have a formula, once where they
-    have none, and of robust losses only near the solution at weight 1: then its weight is settled. At rest it is
-    applied once more (`confirmed`), and the weight is final if that is the same, else the loop goes on with the other.
+    A rule is applied (`updated`) at every point until steps are short if solutions have a closed form, otherwise once,
+    and for robust losses only near the solution at weight 1: then its weight is settled. At convergence it is applied
+    once more (`confirmed`), and the weight is final if unchanged; otherwise the loop continues with the new one.
 
-    ``rule`` is None for a number; ``weights`` are all that it chose in turn, ``selection`` the last one.
-    ``settled``: the weight stays while the loop comes to rest; ``final``: for good. ``robust``: the loss is a sum over
-    rows, but no square.
+    ``rule`` is None for a number; ``weights`` are all that it selected in turn, ``selection`` is the last one.
+    ``settled``: the weight is kept until convergence; ``final``: for good. ``robust``: the loss is a sum over rows, but
+    not quadratic.
     """
 
     rule: Selector | None
@@ -122,7 +122,7 @@ class WeightChoice:
         if not (np.isfinite(weight) and weight >= 0):
             raise InputError(f"selector {selection.name}", f"weight {weight}", "a number, zero or more")
         chosen = replace(self, weight=weight, selection=selection, weights=(*self.weights, weight))
-        if not program.closed_form:  # whose paths are dear: the next answer is asked for where this one leads
+        if not program.closed_form:  # paths are expensive: the rule is asked again where this weight leads
             chosen = replace(chosen, settled=True)
         return chosen._checked()
 
@@ -135,11 +135,11 @@ class WeightChoice:
         if self.final:
             return self
         again = replace(self, settled=False).updated(program)
-        apart = SAME  # by how much logarithms of weights differ that a rule tells apart
+        apart = SAME  # least difference of ln(weight) that counts
         selection = again.selection
         if self.robust and program.closed_form:
             apart = SAME_ROBUST
-        elif selection is not None and selection.interior:  # an answer from a grid is no closer than its neighbours
+        elif selection is not None and selection.interior:  # a weight from a grid is only accurate to its neighbours
             order = np.sort(selection.weights)
             place = int(np.searchsorted(order, selection.weight))
             if 0 < place < len(order) - 1 and order[place] == selection.weight and order[place - 1] > 0:
@@ -153,7 +153,7 @@ class WeightChoice:
         turns = [self.weights[0]]
         turns += [b for a, b in zip(self.weights, self.weights[1:], strict=False) if not _same(a, b)]
         ended = _alternate(turns, SAME) or len(turns) >= MOST_CHOICES
-        if self.settled and len(turns) >= 3:  # leads where it led before
+        if self.settled and len(turns) >= 3:  # cycles
             ended = ended or _same(turns[-1], turns[-3], SAME_SEARCH)
         last: Sequence[float] = turns
         if not ended and self.robust:  # closer to each other than `SAME`
@@ -199,10 +199,9 @@ def weight_choice(weight: float | Selector, penalized: bool) -> WeightChoice:
 class State:
     """State of the loop: the program linearized at z (n,) [scales], the weight, and the nonlinear objective.
 
-    ``size`` (n,) is the largest norm that each column of A has had, ``damping`` the weight of |size (step)|^2.
-    ``stalled`` counts the evaluations since the objective was last lowered beyond its accuracy, to ``lowest``.
-    ``outcome`` is how the loop ended (``"converged"``, ``"stalled"``, ``"far"``), ``floor`` what a vanishing one is
-    compared with.
+    ``size`` (n,) is the largest norm so far of each column of A, ``damping`` the weight of |size (step)|^2. ``stalled``
+    counts evaluations since the objective last decreased beyond its accuracy, to ``lowest``. ``outcome`` is how the
+    loop ended (``"converged"``, ``"stalled"``, ``"far"``), ``floor`` the reference for a vanishing objective.
     """
 
     z: Array
@@ -237,8 +236,8 @@ class State:
 class Loop:
     """The loop of one problem: its source of linear models, the user's formulation, and the one that is solved.
 
-    Of data in blocks these differ: ``reweigh`` makes squares of a robust loss where rows are read. ``about`` are the
-    linearization points (n,) [SI] of predicted positions in constraints.
+    The formulations differ for data in blocks: ``reweigh`` then models a robust loss by squares while rows are read.
+    ``about`` are the linearization points (n,) [SI] of predicted positions in constraints.
     """
 
     source: Source
@@ -310,7 +309,7 @@ class Loop:
         if choice.settled:
             return state
         if choice.robust and not choice.weights and self.options.max_iterations > FEW_ITERATIONS:
-            # where weight 1 leads: at nominal the answer would be about outliers that no fit has shown yet
+            # where weight 1 leads: at nominal, outliers are not visible yet
             return state.weighted(replace(choice, weight=1.0, settled=True))
         return state.weighted(choice.updated(self._judged(state)))
 
@@ -350,19 +349,19 @@ class Loop:
         except NoSolutionFound:
             if not 0 < state.damping <= DAMPING_MOST:
                 raise
-            # hardly identified directions, which damping bounds
+            # hardly identified directions, bounded by damping
             return replace(state, damping=DAMPING_GROWTH * state.damping, evaluations=state.evaluations + 1)
         choice, length = state.choice, state.relative(float(np.linalg.norm(solution - state.z)))
         predicted = state.merit - state.program.objective(solution, choice.weight)
         accuracy, best = self._accuracy(state)
         short, nothing = length <= self.options.tolerance, predicted <= accuracy
         if state.damping > 0 and (short or nothing) and state.stalled < STALLED_MOST:
-            return replace(state, damping=0.0)  # a short step of a damped program says nothing: ask for the full one
+            return replace(state, damping=0.0)  # a short step of a damped program proves nothing: take the full one
         at_rest = predicted <= best or state.stalled >= (STALLED if nothing else STALLED_MOST)
         if choice.settled and at_rest:
             return replace(state, outcome="converged")
         waiting = choice.settled and not choice.final and not choice.weights
-        if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
+        if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the first weight leads
             return self.selected(state)
         return self._stepped(state, solution, predicted, short, accuracy)
 
@@ -373,7 +372,7 @@ class Loop:
         after = candidate.objective(z, state.choice.weight)
         rounding = ROUNDING * abs(state.merit) + state.floor
         fall, gain, nothing = state.merit - after, 1.0, predicted <= accuracy
-        if predicted > 0 and not (nothing and abs(fall) <= rounding):  # else rounding would damp
+        if predicted > 0 and not (nothing and abs(fall) <= rounding):  # otherwise rounding would cause damping
             gain = fall / predicted
         effect = float(np.sum((state.size * (z - state.z)) ** 2))
         damping = damped(state.damping, gain, predicted, effect)
@@ -398,9 +397,9 @@ class Loop:
         return program.solve(state.choice.weight, damping=damping, **how).z
 
     def _accelerated(self, state: State, solution: Array) -> Array:
-        """Let a step follow the curve of the residual: the program again, with b moved by half the curvature along it.
+        """Let a step follow the curve of the residual: solve again, with b shifted by half the curvature along it.
 
-        Geodesic acceleration (Transtrum and Sethna 2012, arXiv:1201.5885).
+        This is geodesic acceleration (Transtrum and Sethna 2012, arXiv:1201.5885).
         """
         step = solution - state.z
         source, model = self.source, state.program.model
@@ -448,7 +447,7 @@ class Loop:
             return EXACT * size, -np.inf
         if not np.isfinite(state.merit):  # outside the functions' domain: any point inside is better
             return 0.0, -np.inf
-        size = max(size, 1.0)  # an interior point's accuracy is absolute below one squared sigma
+        size = max(size, 1.0)  # an interior-point method's accuracy is absolute below one squared sigma
         return INTERIOR * size, BEST * size
 
 
@@ -472,8 +471,8 @@ def minimize(
 ) -> Ended:
     """Run the loop from deviations ``start`` (n,) [SI], and certify the result.
 
-    Positions that constraints bound are linear about a point: then it runs again about its solution until they are
-    those of the solution. Where solutions move as far as the point does, the next round linearizes between them.
+    Constraints on positions are linearized: the loop is repeated about its solution until both agree. If the solution
+    moves as far as the linearization point, the next round linearizes between them.
     """
     loop = replace(Loop.of(problem, formulation, options), about=start)
     ended = _certified(loop, problem, loop.run(weight, start))
@@ -493,7 +492,7 @@ def minimize(
         factor = 0.0
         if moved.any():
             factor = np.linalg.norm((ended.x - before.x) / loop.scale) / np.linalg.norm(moved / loop.scale)
-        # of a solution that moves against the point by a factor the fixed point is at 1 / (1 + factor) of the way
+        # if the solution moves against the point by a factor, the fixed point is at 1 / (1 + factor) of the way
         share = max(1 / (1 + factor), LEAST_SHARE) if factor > 0.5 else 1.0
         moved = share * step
         about = about + moved
@@ -509,7 +508,7 @@ def nearby(problem: Source, formulation: Formulation, start: Array, steps: int) 
 def _certified(loop: Loop, problem: Source, state: State) -> Ended:
     """Certify the end of a loop by functions and model asked anew; blocks by the squares that stand for the loss."""
     model, residual = state.program.model, None
-    if loop.source.keeps_rows:  # of more than fits into memory the last iteration has to do
+    if loop.source.keeps_rows:  # without rows in memory, the last iteration has to suffice
         anew = in_parts(problem.frozen())
         if isinstance(anew, CalibrationProblem):
             residual = lambda z: anew.whitened_residual(loop.scale * z)  # noqa: E731

@@ -52,16 +52,16 @@ from rpim_opt.problem.row_functions import transform
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.parameters import own_name
 
-CONTRADICTED = 1e-6  # probability of what constraints cost, if they hold for the robot, below which they do not
-COVERAGE_FACTOR = 2.0  # of an expanded uncertainty where no confidence is stated: about 95 % of a normal distribution
+CONTRADICTED = 1e-6  # p-value of the cost of constraints below which they contradict the data
+COVERAGE_FACTOR = 2.0  # without a stated confidence: about 95 % of a normal distribution
 
 
 class Prediction(NamedTuple):
     """Predicted positions (N, 3) in the instrument's frame [m] with their ``covariance`` (N, 3, 3) [m^2].
 
-    ``coverage_factor`` is k of U = k u, (N, 1) where rows have degrees of freedom of their own: readings of an unknown
-    session, whose offset few sessions estimate. ``outside`` are the rows beyond the measured joint ranges: there an
-    interval may be too narrow.
+    ``coverage_factor`` is k of U = k u; (N, 1) if rows have own degrees of freedom: readings of an unknown session,
+    whose offset is estimated from few sessions. ``outside`` are the rows beyond the measured joint ranges, where
+    intervals may be too narrow.
     """
 
     position: Array
@@ -106,7 +106,7 @@ class Outcome:
     known: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        vars(self).update(self.known)  # in the place of what the cached properties of these names would compute
+        vars(self).update(self.known)  # instead of computing the cached properties of these names
 
     @property
     def z(self) -> Array:
@@ -117,10 +117,10 @@ class Outcome:
     def contradiction(self) -> str:
         """Sentence on constraints that data contradict; empty if there are none, or the loss has no quadratic model.
 
-        Without constraints the sum of squares falls by chi-square of as many degrees of freedom as are active, if they
-        hold for the robot, times the residuals' variance where that is larger than the noise. Of a robust loss they
-        are the squares of what it keeps without constraints. A penalty that is not quadratic is no prior: it must not
-        be what falls alone, and parameters where its slope jumps count as active.
+        If the constraints hold for the robot, the sum of squares without them is smaller by chi-square with one degree
+        of freedom per active constraint, times the residuals' variance if that exceeds the noise. For a robust loss the
+        squares are those of its inliers without constraints. A penalty that is not quadratic is no prior: a decrease of
+        it alone does not count, and parameters where its slope jumps count as active.
         """
         program = self.program
         if not self.formulation.solvable or self.moves is None:
@@ -160,7 +160,7 @@ class Outcome:
         >>> (1e3 * (result.robot.mdh - result.problem.robot.mdh)[:, 3]).round(2)  # deviations of d [mm]
         array([0.17, 0.45, 0.45, 0.45, 3.82, 0.7 ])
         """
-        return self.robots["" if "" in self.problem.arms else self.problem.robot.name]  # says which, of several
+        return self.robots["" if "" in self.problem.arms else self.problem.robot.name]  # of several robots it names one
 
     @property
     def robots(self) -> Mapping[str, Robot]:
@@ -188,14 +188,14 @@ class Outcome:
     ) -> Array:
         """Return the transforms (N, 4, 4) of a reflector in the instrument's frame, with the identified parameters.
 
-        Base, robot and tool, gears and joints' elasticity included, joints in the middle of their backlash unless
-        `columns` say otherwise; of `robot` alone: `forward_kinematics`.
+        They include base, robot and tool, transmissions and elasticity of joints, with joints in the middle of their
+        backlash unless `columns` state directions; `forward_kinematics` is of the robot alone.
 
-        q (N, dof) are joint values of the controller [rad or m]; ``marker`` and ``robot`` the only ones by default;
-        ``torque`` (N, dof) joint torques [Nm], where compliances were identified from measured ones; ``payload`` the
-        mass at the flange [kg], one or (N,), instead of that of the robot's `Gravity`; ``columns`` what terms of your
-        own see, by name, (N,) each [SI], "approach" (N, dof) the direction in which each joint came, -1 or 1, where
-        backlash was identified.
+        q (N, dof) are joint values of the controller [rad or m]; ``marker`` and ``robot`` may be omitted if there is
+        one; ``torque`` (N, dof) are joint torques [Nm], if compliances were identified from measured ones; ``payload``
+        is the mass at the flange [kg], a number or (N,), instead of that of the robot's `Gravity`; ``columns`` are
+        those of user-defined terms by name, (N,) each [SI], and "approach" (N, dof), the direction in which each joint
+        came, -1 or 1, if backlash was identified.
 
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
@@ -218,11 +218,11 @@ class Outcome:
     ) -> Prediction:
         """Return predicted positions of a reflector with their uncertainty; arguments as for `forward`.
 
-        ``marker`` may be N names as well, one for each row.
-        Positions in the instrument's frame, with standard uncertainties u and expanded ones U = 2 u, or U = k u with
-        Student's factor of a ``confidence``: with ``of`` ``"mean"`` of what the model says, J C J'; ``"reached"`` of
-        the position that the robot will reach, with its repeatability; ``"reading"`` of what the instrument will read
-        there. InputError for a penalty without covariance (lasso), for which `forward` gives the positions.
+        ``marker`` may also be N names, one per row. Positions are in the instrument's frame, with standard
+        uncertainties u and expanded ones U = 2 u, or with ``confidence`` U = k u with Student's factor. ``of="mean"``
+        is the uncertainty of the model's position, J C J'; ``"reached"`` that of the position reached by the robot,
+        with its repeatability; ``"reading"`` that of the instrument's reading there. InputError for a penalty without
+        covariance (lasso), for which `forward` gives the positions.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -233,7 +233,7 @@ class Outcome:
         """
         if of not in get_args(Interval):
             raise InputError("of", f"'{of}'", choices(of, get_args(Interval)))
-        fit = self.fit_covariance  # refuses a penalty without covariance before anything is computed
+        fit = self.fit_covariance  # raises for a penalty without covariance before any computation
         noise = position_noise(self.problem)
         problem = self.problem.sample().measuring(q, position, marker, torque, payload, columns, robot, noise)
         N = len(problem.data)
@@ -267,7 +267,7 @@ class Outcome:
     def error_vectors(self, data: Dataset | None = None, nominal: bool = False) -> Array:
         """Return measured minus modelled position of every row, (N, 3) [m]; NaN without a measured position.
 
-        Of the identification data by default; ``nominal``: of the nominal robot, as in `nominal_errors`.
+        By default of the identification data; with ``nominal``, of the nominal robot as in `nominal_errors`.
         """
         source, x = self._at(data, nominal)
         return np.concatenate([error_vectors(part, x) for part in source.rows()])
@@ -275,7 +275,7 @@ class Outcome:
     def errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
         """Return the norm of every row's residual, (N,) [m], of the identification data by default.
 
-        With the dimension ``"angle"`` the orientation error [rad], NaN for rows that are no poses; or ``"pixel"``.
+        ``dimension="angle"`` is the orientation error [rad], NaN for rows that are not poses; ``"pixel"`` that of images.
 
         >>> import rpim_opt as ro
         >>> instance = ro.load("pose")
@@ -289,8 +289,8 @@ class Outcome:
     def nominal_errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
         """Return the error of every row for the nominal robot, (N,) [m]; arguments as for `errors`.
 
-        Frames (base, reflectors, anchors, ...) that the calibration identifies are fitted to the identification data
-        first, of an update to the earlier ones, too: before that they do not describe the robot.
+        Frames (base, reflectors, anchors, ...) that the calibration identifies are first fitted to the identification
+        data, in an update also to the earlier ones: their nominal values do not describe the robot.
         """
         source, x = self._at(data, nominal=True)
         return source.errors(x, dimension)
@@ -302,9 +302,9 @@ class Outcome:
 
     @cached_property
     def _nominal(self) -> tuple[Source, Array]:
-        """The problem that identifies frames alone, and its solution under the prior that the scales state.
+        """The problem that identifies frames only, and its solution under the prior of the scales.
 
-        Of a recalibration under its own prior, which is the earlier rows: the new ones may determine few frames.
+        A recalibration uses its own prior, the earlier rows: the new ones may determine few frames.
         """
         form, p = self.program.penalty_form, self.stated.parameters
         frames = p.of_frames & p.identified
@@ -441,8 +441,8 @@ class Outcome:
     def covariance(self) -> Array:
         """Covariance of the deviations (n, n) [SI]: C = sigma^2 S (A'A + weight I)^-1 S + D D'.
 
-        `Uncertainty` documents its contents and validity; D D' is zero with a weight of your own. It is
-        conditional on active constraints; variances that neither data nor penalty decide are infinite.
+        `Uncertainty` documents its contents and validity; D D' is zero with a weight of your own. It is conditional on
+        active constraints; variances that neither data nor penalty determine are infinite.
         """
         return self.fit_covariance.covariance
 
@@ -457,7 +457,7 @@ class Outcome:
     def parameter_rows(self) -> list[dict[str, Any]]:
         """Return parameter, unit, nominal, identified, deviation and std of every identified parameter, in that unit.
 
-        ``std`` is None where the formulation has no covariance, or an infinite one.
+        ``std`` is None if the formulation has no covariance, or an infinite one.
         """
         free = self.problem.parameters.free
         C = self.known_covariance
@@ -467,10 +467,10 @@ class Outcome:
 
     @cached_property
     def flagged(self) -> tuple[Flag, ...]:
-        """Outliers, the worst first: rows above `robust_loss.outlying` for the noise that the other rows show.
+        """Outliers, the worst first: rows above `robust_loss.outlying` for the noise of the other rows.
 
-        After a robust loss those of them that a fit without them contradicts, because it may sacrifice half of few rows
-        to the other half. After a squared loss outliers may hide behind each other: a robust loss finds them.
+        After a robust loss only those that a fit without them contradicts, since it may fit half of few rows at the
+        expense of the other half. After a squared loss outliers may mask each other: a robust loss finds them.
 
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("blunders").problem, ro.robust, weight=1.0)
@@ -488,7 +488,7 @@ class Outcome:
         groups = np.array([number[flag.label] for flag in flags])
         try:
             weight = self.penalty_weight / self.squares.factor
-        except InputError:  # a loss with own variables has no quadratic model by which a row could be contradicted
+        except InputError:  # a loss with own variables has no quadratic model for that test
             return flags
         sure = contradicted(model, program.penalty_form, weight, default_widths(free) / free.scale, groups)
         return tuple(flag for flag, certain in zip(flags, sure, strict=True) if certain)
@@ -502,7 +502,7 @@ class Outcome:
     def clustered(self) -> tuple[str, ...]:
         """Labels of flagged rows whose errors are correlated with those of neighbours in joint space or time.
 
-        They are no outliers: the model lacks something there, or the set-up moved. `without_flagged` keeps them.
+        They are not outliers: the model is incomplete there, or the setup moved. `without_flagged` keeps them.
         """
         problem = self.problem
         if not self.flagged or not isinstance(problem, CalibrationProblem):
@@ -523,7 +523,7 @@ class Outcome:
     def without_flagged(self) -> Self:
         """Return the calibration without the flagged rows, with the same formulation, selector and solver.
 
-        Rows that are `clustered` stay: without them the robot would be extrapolated where the model fails.
+        `clustered` rows stay: without them the robot would be extrapolated where the model fails.
         """
         rest = self.stated.without({flag.label for flag in self.single})
         size = {f.label: in_unit(f.error, f.dimension) for f in self.single}
@@ -535,9 +535,9 @@ class Outcome:
     def active_bounds(self) -> tuple[ActiveBound, ...]:
         """The parameters at an active bound, the largest multiplier first.
 
-        ``gain`` is by how much the root of the loss per equation (for a squared loss the whitened RMS) would fall if
-        the bound were loosened by a tenth of its size, from its multiplier. A large gain is an alarm: wrong data, or a
-        drawing that does not describe this robot.
+        ``gain`` is the decrease of the root of the loss per equation (for a squared loss the whitened RMS) for
+        loosening the bound by a tenth of its size, computed from its multiplier. A large gain is an alarm: wrong data,
+        or nominal parameters that do not describe this robot.
         """
         program, z = self.program, self.z
         if program.box is None or not program.formulation.constraints:

@@ -34,7 +34,7 @@ class Calibration(Outcome):
     converged
         Whether the loop ended at a solution that the certificate confirms.
     message
-        How the loop ended, in a sentence. It does not judge the data: whether to use the robot is the `verdict`.
+        How the loop ended, in a sentence. It is no judgement of the data: that is the `verdict`.
     history
         The iterations, with objective, step and weight.
     program
@@ -42,18 +42,18 @@ class Calibration(Outcome):
     certificate
         Evidence that this is a solution, recomputed from the functions that define it.
     calibrate_again
-        `calibrate` with all its arguments but the problem; others may replace them.
+        `calibrate` with all its arguments except the problem; keywords replace them.
     record
         Origin of the data, for files and reports.
     learned
         Estimated hyperparameters: scales and noise, model extensions, excluded rows; None with a weight.
     mapping
-        Signs and zeros of the joints estimated from the data; None where the nominal ones explain them.
+        Signs and zeros of the joints estimated from the data; None if the nominal ones explain them.
     excluded
-        The rows that were excluded as outliers; None without any, of data in blocks and of a result that was read.
+        The rows excluded as outliers; None without any, for data in blocks and for a result read from a file.
     known
-        Values of ``causes``, ``active_bounds``, ``shadow_prices`` and ``squares``, which then are not computed: of a
-        result that was read from a file its causes, and what a script's functions gave, which a file cannot hold.
+        Values of ``causes``, ``active_bounds``, ``shadow_prices`` and ``squares`` that are not computed: for a result
+        read from a file its causes, and those of a script's functions, which a file cannot hold.
 
     Examples
     --------

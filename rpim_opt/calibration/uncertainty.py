@@ -23,8 +23,8 @@ from rpim_opt.problem.multi_robot import identifying_sessions
 from rpim_opt.robot.parameters import of_session
 from rpim_opt.robot.terms import transmission
 
-UNINFORMATIVE = 1e4  # variance of an unknown session over a reading's, from which on an interval says nothing
-RARE = 0.01  # probability that data like those of the calibration have any row that is named
+UNINFORMATIVE = 1e4  # variance of an unknown session over a reading's, above which an interval is useless
+RARE = 0.01  # probability that data like the calibration's have any named row
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -33,23 +33,23 @@ class Uncertainty(Tabled):
 
     With A = U diag(s) V' whitened and scaled, weight w and the noise level sigma::
 
-        noise      sigma^2 S V diag(s^2 / (s^2 + w)^2) V' S          what other data of this kind would change
-        prior      sigma^2 S V diag(w / (s^2 + w)^2) V' S            what the penalty holds back: its bias, in the mean
+        noise      sigma^2 S V diag(s^2 / (s^2 + w)^2) V' S          variation between data sets of this kind
+        prior      sigma^2 S V diag(w / (s^2 + w)^2) V' S            mean squared bias by the penalty
         total      noise + prior = sigma^2 S (A'A + w)^-1 S          if deviations are as large as the penalty expects
 
-    Where hyperparameters were estimated, ``prior`` holds besides what is not known of them (Kass and Steffey 1989), by
-    how much Student's tails are wider than the normals that stand for them, and what the model lacks, as far as halves
-    of the joints' ranges miss more of each other than chance would (`Learned.drift`).
+    If hyperparameters were estimated, ``prior`` also includes their uncertainty (Kass and Steffey 1989), the excess
+    width of Student's tails over the normals that represent them, and model errors, as far as halves of the joints'
+    ranges predict each other worse than by chance (`Learned.drift`).
 
-    It holds for a squared loss, or for the rows that a robust loss keeps, and a squared penalty; other penalties
-    (lasso) are refused. Intervals do not know of the active bounds of parameters in ``result.actively_constrained``.
+    It holds for a squared loss, or for the inliers of a robust loss, and a squared penalty; InputError for other
+    penalties (lasso). Intervals disregard active bounds of the parameters in ``result.actively_constrained``.
 
     Parameters
     ----------
     result
-        The calibration. InputError for a penalty without covariance.
+        The calibration.
     confidence
-        Of the intervals, between 0 and 1.
+        Confidence of the intervals, between 0 and 1.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -64,7 +64,7 @@ class Uncertainty(Tabled):
     confidence: float = 0.95
 
     def __post_init__(self) -> None:
-        coverage_factor(self.result.fit_covariance.residual_dof, self.confidence)  # refuse what has no interval
+        coverage_factor(self.result.fit_covariance.residual_dof, self.confidence)  # raises if there is no interval
 
     @property
     def coverage_factor(self) -> float:
@@ -119,9 +119,9 @@ def position_budget(result: Outcome, q: Array, marker: str | None = None) -> dic
 class TransmissionError(NamedTuple):
     """Transmission error of a joint (from 1) at values ``q`` (K,), and its standard uncertainty [rad].
 
-    As the controller counts the joint, or the model one that is coupled to several of its; ``called`` says which.
-    ``measured`` are the least and largest measured value [rad], ``effect`` is the RMS of what the error moves in the
-    measured lengths [m], ``names`` are those of its coefficients.
+    Angles count as the controller's joint value, or as the model's for a joint coupled to several; ``called`` says
+    which. ``measured`` are the least and largest measured value [rad], ``effect`` is the RMS change of measured lengths
+    by the error [m], ``names`` are those of its coefficients.
     """
 
     joint: int
@@ -160,7 +160,7 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
         length[stack.index] = stack.length
     rows = max(len(np.unique(part.owners[length])), 1)
     at = part.joint_values
-    if result.record.earlier:  # what was measured before them counts, at the corners of its ranges
+    if result.record.earlier:  # earlier measurements count, at the corners of their ranges
         at = np.vstack([at, *(ends @ part.robot.joint_map.T for ends in result.ranges.values())])
     errors = []
     for curve in part.robot.model.curves:
@@ -186,8 +186,8 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
 def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
     """Return deviations (draws, n) [SI] identified from data simulated at the fit with noise of the observed level.
 
-    The check of the law of propagation (JCGM 101), with bounds and any loss: the spread of the draws is to be compared
-    with `FitCovariance.noise`. Every draw solves the linearized program at the same weight.
+    It checks the law of propagation (JCGM 101), with bounds and any loss: compare the spread of the draws with
+    `FitCovariance.noise`. Every draw solves the linearized program at the same weight.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -202,7 +202,7 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
     fitted = program.model.A @ result.z
     if result.known_covariance is not None:
         variance = result.fit_covariance.noise_variance
-    else:  # no degrees of freedom are known: as many as parameters
+    else:  # unknown degrees of freedom: as many as parameters
         squares = np.sum((fitted - program.model.b) ** 2)
         variance = squares / max(program.model.equations - len(result.z), 1)
     level = np.sqrt(variance)
@@ -217,9 +217,9 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
 def held_out_errors(result: Outcome, data: Dataset, counted: np.ndarray | None = None) -> HeldOut:
     """Return the errors of a calibration on measurements that it did not use, with their prediction intervals.
 
-    Coverage and fit are those of the rows that are ``counted`` (N,), by default all. Where sessions stand apart, rows
-    of one that was not measured have no interval. The fit is by the joint prediction of r, with the covariances V of
-    readings and C of the deviations, which all rows share::
+    Coverage and fit are those of the ``counted`` rows (N,), by default all. If sessions are apart, rows of an
+    unmeasured session have no interval. The fit is by the joint prediction of r, with the covariances V of readings and
+    C of the deviations, which all rows share::
 
         chi^2 = r' (V + A C A')^-1 r = |u|^2 - u' B (I + B' B)^-1 B' u,    u = V^-1/2 r,    B = V^-1/2 A C^1/2
     """

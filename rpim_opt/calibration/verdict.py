@@ -75,47 +75,47 @@ from rpim_opt.robot.mdh import MDH, Robot, numbered
 from rpim_opt.robot.parameters import frame_of, own_name
 
 BAD = "Larger than expected"
-"""Beginning of the sentence on a fit whose residuals or deviations are large; where it is delivered all the same."""
+"""Beginning of the sentence on a fit with large residuals or deviations that is delivered all the same."""
 SLIGHTLY = "Slight, but significant"
-"""Beginning of the sentence on an effect in residuals that are no larger than instrument and robot make them."""
+"""Beginning of the sentence on an effect in residuals that are as small as instrument and robot explain."""
 LIMITED = "the formulation, not the robot, limits the fit"
-"""Beginning of the cause that loss, penalty or constraints contradict the data."""
-REMARKS = (BAD, SLIGHTLY)  # beginnings of what is said of robots that are delivered, too
-OVERSTATED = 0.05  # residual RMS over the stated noise below which it is not theirs; of nominal errors 1 / NOISY
+"""Beginning of the cause if loss, penalty or constraints contradict the data."""
+REMARKS = (BAD, SLIGHTLY)  # beginnings of sentences on delivered robots, too
+OVERSTATED = 0.05  # residual RMS over the stated noise below which the statement is wrong; for nominal errors 1 / NOISY
 REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
-"""Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise; a service robot had 5.3 mrad."""
+"""Estimated repeatability [m, rad] beyond any robot's, whatever the stated noise; a service robot had 5.3 mrad."""
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
-"""Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
+"""Deviation of machined dimensions [rad, m] beyond any robot's; joint zeros, set at assembly, are not limited."""
 UNUSUAL = {"length": 0.004, "angle": 0.05}
-"""Deviation [m, rad] from which on a wrong frame, of a length also another robot, is the likelier reason."""
+"""Deviation [m, rad] above which a wrong frame, for lengths also another robot, is more likely."""
 SCALED, BY_CHANCE, STATED = 0.001, 0.005, 6
-"""Common deviation of the longest link [m] from which a wrong scale is the likelier reason, and its probability: F test
-against the other deviations of lengths, and their stated scale as so many more."""
-UNSCALED, SIGMAS = 0.005, 3.0  # that from which on no machined robot has it, also in stated standard deviations
-MOST_SCALED = 0.3  # beyond that no scale is off, but a unit
+"""Common deviation of the longest link [m] above which a wrong scale is more likely, and its p-value: F test against
+the other deviations of lengths, with their stated scale as that many more."""
+UNSCALED, SIGMAS = 0.005, 3.0  # such a deviation beyond any machined robot's, also in stated standard deviations
+MOST_SCALED = 0.3  # above it, not a scale but a unit is wrong
 LENGTHS, PRIORS = 2, 0.75
-"""Identified lengths from which on a common deviation is more than that of each; part of one that a prior decides."""
-ALIKE = 0.045  # part of an effect on the data that others may leave where these do not distinguish them
-DEPENDENT = 1e-6  # singular value of effects, over the largest, below which they are combinations of the others
-TAKES_PART = 0.1  # part of the largest share in an effect from which on a frame parameter is named
-WIDE = 1e4  # prior standard deviations of what has no penalty
-REPEATABLE = 2e-4  # part of an arm's length up to which industrial robots repeat: data sheets state 0.02 to 0.1 mm
-EXCLUDED = 0.25  # share of the rows that may be outliers
+"""Identified lengths needed for a common deviation; largest part of a deviation that the prior may determine."""
+ALIKE = 0.045  # part of an effect on the data that others may leave if the data do not distinguish them
+DEPENDENT = 1e-6  # relative singular value below which effects are linearly dependent
+TAKES_PART = 0.1  # part of the largest share in an effect for which a frame parameter is named
+WIDE = 1e4  # prior standard deviations of parameters without penalty
+REPEATABLE = 2e-4  # upper bound on industrial robots' repeatability over arm length: data sheets state 0.02 to 0.1 mm
+EXCLUDED = 0.25  # largest share of outliers
 COMPUTED, COMPUTED_RMS = 0.05, 2e-5  # nominal RMS over the stated noise, and itself [m], of computed positions
-ROUNDED = 1.1  # nominal RMS over what rounding of the measured values makes, below which they were computed, too
-SPARE = 2.0  # equations per parameter of the frames below which nominal errors may vanish by themselves
-INTERPOLATED = 0.1  # residual degrees of freedom below which nothing checks a fit; 73 good tables of few rows left 0.3
-WORSE = 3.0  # standard errors by which squared errors on held-out rows are above those of the nominal robot
-ROWS = 12  # rows below which a standard error of squares says too little, and only twice the nominal error counts
-UPWARD = 5.0  # standard deviations by which a compliance is below zero, which gravity cannot cause
-NOTABLE = 0.5  # effect of a joint's compliance over the largest, below which wrong masses explain its sign
-ELSEWHERE = 0.5  # part of the residuals that identifying the base may leave before its statement is called wrong
-HOPELESS = 20.0  # residuals over the stated noise from which something is said even if nothing explains them
-OUTSIDE = 2.0  # ranges of a joint by which no other zero puts its values outside of its limits
-SCALES = 10.0  # scales by which a parameter of the robot may deviate
-LARGEST_CURVE = 0.01  # standard deviation of transmission errors [rad] beyond any gear: real ones are below 1 mrad
+ROUNDED = 1.1  # nominal RMS over the rounding of measured values, below which they were computed, too
+SPARE = 2.0  # equations per parameter of the frames below which nominal errors may be zero
+INTERPOLATED = 0.1  # residual degrees of freedom below which nothing checks a fit; 73 good small tables had 0.3 or more
+WORSE = 3.0  # standard errors by which squared held-out errors exceed the nominal robot's
+ROWS = 12  # fewer rows give no useful standard error: only twice the nominal error counts
+UPWARD = 5.0  # standard deviations of a compliance below zero, which gravity cannot cause
+NOTABLE = 0.5  # a joint's effect of compliance over the largest, below which wrong masses explain its sign
+ELSEWHERE = 0.5  # part of the residuals left by identifying the base, below which its statement is wrong
+HOPELESS = 20.0  # residuals over the stated noise from which an unexplained fit is reported
+OUTSIDE = 2.0  # distance from the limits in ranges of a joint that no other zero explains
+SCALES = 10.0  # scales by which a robot's parameter may deviate
+LARGEST_CURVE = 0.01  # standard deviation of transmission errors [rad] beyond any gear's: real ones are below 1 mrad
 LARGEST = {"length": 0.02, "angle": 0.05}  # a machined and assembled robot deviates by less than this [m, rad]
-ARM = ("compliance", "moment", "ecc", "transmission")  # beginnings of extension parameters that are the arm's own
+ARM = ("compliance", "moment", "ecc", "transmission")  # beginnings of extension parameters of the arm
 NOTHING = (
     "None of the tested input mistakes explains the residuals. Check the nominal parameters; did the arm move while it "
     "was measured, or is it compliant?"
@@ -126,11 +126,10 @@ NOTHING = (
 class Verdict:
     """Whether the robot of a calibration is delivered.
 
-    Exit codes, exports, compensation and the report follow it. ``reasons`` say why it is not delivered, a sentence
-    each; empty where it is. ``caution`` is the condition that it depends on and that uncertainties do not contain:
-    signs and zeros of joints that were estimated, constraints that the data contradict, a stated frame whose error
-    would look like a large deviation of the robot, joints that hardly moved, readings that scatter; empty where there
-    is none.
+    Exit codes, exports, compensation and the report follow it. ``reasons`` state why it is not delivered, a sentence
+    each; empty if it is. ``caution`` is a condition that uncertainties do not include: estimated signs and zeros of
+    joints, constraints that the data contradict, a stated frame whose error would appear as a large deviation of the
+    robot, joints that hardly moved, inconsistent readings; empty without any.
 
     >>> import rpim_opt as ro
     >>> print(ro.calibrate(ro.load("position").problem, "tikhonov", 1.0, max_iterations=1).verdict)
@@ -160,7 +159,7 @@ class Verdict:
     def require(self, forced: bool = False) -> str:
         """Return the note for a robot used despite its verdict; if it is delivered, its caution.
 
-        NotDelivered with the reasons, unless ``forced``.
+        NotDelivered with the reasons if it is not delivered, unless ``forced``.
         """
         if self.delivered:
             return self.caution
@@ -175,12 +174,12 @@ class Verdict:
 def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     """Return the verdict on a calibration, with likely input mistakes, one sentence each.
 
-    Not delivered is a robot whose fit did not converge; whose new rows an update does not explain; whose residuals
-    without outliers are beyond 3 times the stated noise and 0.3 % of the arm's length; whose repeatability, deviations
-    or share of outliers no robot has; whose errors on held-out rows are larger than the nominal robot's, or that
-    interpolates all rows; whose data were computed; and one with a likely mistake. The limits were set on 48 tables
-    with mistakes and 36 good ones; joint zeros are not limited. Where the formulation limits the fit, other reasons
-    than held-out rows follow from that, and are not named.
+    A robot is not delivered if the fit did not converge; if an update does not explain its new rows; if residuals
+    without outliers exceed both 3 times the stated noise and 0.3 % of the arm's length; if repeatability, deviations or
+    share of outliers are beyond any robot's; if held-out errors exceed the nominal robot's; if the fit interpolates all
+    rows; if the data were computed; or if an input mistake is likely. The limits were set on 48 tables with mistakes
+    and 36 good ones; joint zeros are not limited. If the formulation limits the fit, that is the only reason besides
+    held-out rows.
     """
     mapping = result.mapping.caution if result.mapping else ""
     stretch, sigmas = _stretch(result)
@@ -207,7 +206,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
 def ambiguous_deviation(result: Outcome) -> str:
     """Return a sentence if data do not distinguish deviations from errors of stated frames or of a scale.
 
-    A wrong length of a stated tool is a deviation of the last d, a wrong place beside the last axis one of its theta.
+    A wrong length of a stated tool appears as a deviation of the last d, a wrong lateral position as one of its theta.
     """
     free = result.problem.parameters.free
     least = [UNUSUAL.get(dimension, np.inf) for dimension in free.dimensions]
@@ -263,17 +262,17 @@ def _little_motion(result: Outcome) -> Iterator[str]:
 def _stretch(result: Outcome) -> tuple[float, float]:
     """Return the common deviation of lengths, as by a wrong scale, in stated standard deviations, too; 0 for none."""
     free, C = result.problem.parameters.free, result.known_covariance
-    # of rows that do not fit, and of another robot, deviations say nothing
+    # meaningless for rows that do not fit, and for another robot
     if C is None or any(_residuals(result)) or any(_deviations(result)):
         return 0.0, 0.0
     lengths = (np.array(free.dimensions) == "length") & ~free.of_frames & (free.nominal != 0)
-    fit = result.fit_covariance  # lengths that the prior alone determines are near their nominal values
+    fit = result.fit_covariance  # lengths that only the prior determines are near nominal
     lengths &= np.isfinite(np.diag(C)) & (fit.weight * np.diag(fit.form.prior(fit.weight)) < PRIORS)
     if lengths.sum() < LENGTHS:
         return 0.0, 0.0
     nominal, x = free.nominal[lengths], result.x[lengths]
     scale = free.scale if result.learned is None else result.learned.stated
-    precision = np.linalg.inv(C[np.ix_(lengths, lengths)] + np.diag(scale[lengths] ** 2))  # of deviations found
+    precision = np.linalg.inv(C[np.ix_(lengths, lengths)] + np.diag(scale[lengths] ** 2))  # of estimated deviations
     information = nominal @ precision @ nominal
     stretch = float(nominal @ precision @ x / information)
     gain = stretch**2 * information
@@ -306,7 +305,7 @@ def scaled_by_board(result: Outcome) -> bool:
 def _taking_part(result: Outcome, k: int) -> list[str]:
     """Return the stated frame parameters whose effect on the data is that of parameter k; none if it is not.
 
-    Stated is what is not identified, and what prior or constraints hold. What free frames explain is left out first.
+    Stated frames are those not identified, or held by prior or constraints. Effects of free frames are projected out.
     """
     p = result.problem.parameters
     framed = cast(CalibrationProblem, result.problem).identifying(p.identified | p.of_frames)
@@ -319,7 +318,7 @@ def _taking_part(result: Outcome, k: int) -> list[str]:
     effects /= norms
     stated = ~mine | np.isin(every.names, result.actively_constrained)
     form = result.program.penalty_form
-    if form is not None:  # within its prior, what is stated has less effect than the parameter that took its error up
+    if form is not None:  # within its prior, a stated parameter has less effect than the one that absorbed its error
         prior = np.vstack([result.penalty_weight**0.5 * form.matrix, np.eye(len(result.x)) / WIDE])
         width = np.linalg.norm(np.linalg.pinv(prior), axis=1)
         stated[mine] |= width * norms[mine] < min(width[k], np.abs(result.z[k])) * norms[mine][k]
@@ -382,11 +381,11 @@ def arm_length(problem: Source) -> float:
 def worse_than_nominal(nominal: Array, identified: Array, rows: str = "") -> str:
     """Return a sentence if errors (N,) [m] on some rows, or held-out ones, are larger than those of the nominal robot.
 
-    Significantly, by the mean difference of the squares; otherwise an empty text.
+    They have to be significantly larger, by the mean difference of squares; otherwise the text is empty.
     """
     both = np.isfinite(nominal) & np.isfinite(identified)
     difference = identified[both] ** 2 - nominal[both] ** 2
-    worse = rms(identified[both]) > 2 * rms(nominal[both])  # whatever few large errors make of the standard error
+    worse = rms(identified[both]) > 2 * rms(nominal[both])  # whatever the standard error is with few large errors
     if len(difference) >= ROWS:
         worse |= bool(difference.mean() > WORSE * difference.std(ddof=1) / np.sqrt(len(difference)))
     if not worse:
@@ -405,7 +404,7 @@ def _residuals(result: Outcome) -> Iterator[str]:
     residuals = residual_rms(result)
     checked = _overdetermined(result)
     for each, (size, ratio) in residuals.items():
-        nominal = noise_ratio(result.problem, result.nominal_errors(dimension=each), each)  # with frames fitted
+        nominal = noise_ratio(result.problem, result.nominal_errors(dimension=each), each)  # with fitted frames
         small = 0 < min(ratio / OVERSTATED, NOISY * nominal) < 1  # 0: it was not measured
         stated = each != "angle" or not result.record.noise_assumed  # that of orientations may be assumed far too large
         if checked and stated and size > COMPUTED_RMS and small:
@@ -496,7 +495,7 @@ def _worse(result: Outcome) -> Iterator[str]:
     if held is None and validation is not None:
         held = held_out_errors(result, validation)
     if held is None:
-        checked = result.record.earlier or result.known_covariance is None  # an update is judged against what was known
+        checked = result.record.earlier or result.known_covariance is None  # an update is judged by the earlier result
         if not checked and result.fit_covariance.residual_dof < INTERPOLATED:
             yield (
                 f"The fit interpolates the data: {result.program.model.equations} equations leave no residual degrees "
@@ -516,8 +515,8 @@ def _worse(result: Outcome) -> Iterator[str]:
 def implausible(result: Outcome, held: HeldOut) -> str:
     """Return a sentence if most errors on held-out rows are larger than any robot's own; otherwise an empty text.
 
-    If errors of the calibration's own rows are as large, something else is wrong; if the uncertainty of a calibration
-    from few rows explains them, nothing is.
+    Errors of the same size on the calibration's own rows mean another fault; errors that the uncertainty of a
+    calibration from few rows explains mean none.
     """
     error, most = held.error, REACH * arm_length(result.problem)
     if held.fit is not None and held.fit.likely:
@@ -539,7 +538,7 @@ def _computed(result: Outcome) -> Iterator[str]:
         return
     errors = result.nominal_errors()
     nominal = rms(errors[measured])
-    rounding: list[float] = []  # RMS error [m] that it makes, nothing beyond four decimals of a millimetre
+    rounding: list[float] = []  # RMS rounding error [m], none beyond four decimals of a millimetre
     for block in (block for part in problem.rows() for block in part.data.blocks):
         lengths = [i for i, dimension in enumerate(block.measurement.columns.values()) if dimension == "length"]
         decimals = decimals_of(1e3 * block.y[:, lengths]) if lengths else None
@@ -561,11 +560,11 @@ def _computed(result: Outcome) -> Iterator[str]:
 def likely_causes(result: Outcome) -> list[str]:
     """Return the likely causes of a poor fit, one sentence each; empty if the fit is good.
 
-    A fit is bad if it did not converge, leaves residuals of `NOISY` times the instrument's stated noise in rows that it
-    does not downweight, or deviates by many scales. Then other interpretations (`better_interpretation`), rows without
-    value, exchanged rows, rounded joints and a base that moved are looked for. Where residuals are beyond the noise at
-    all, something systematic is looked for in them, and in excluded rows what they have in common. Known
-    values that the data contradict come first, and are all that is said of data in blocks.
+    A fit is poor if it did not converge, if rows that are not downweighted have residuals above `NOISY` times the
+    stated noise, or if it deviates by many scales. Then other interpretations (`better_interpretation`), rows without
+    values, exchanged rows, rounded joints and a base that moved are sought. If residuals exceed the noise at all,
+    systematic parts are sought in them, and common properties of excluded rows. Contradicted known values come first;
+    data in blocks are checked for these only.
 
     >>> from dataclasses import replace
     >>> import rpim_opt as ro
@@ -599,7 +598,7 @@ def likely_causes(result: Outcome) -> list[str]:
             _limited_by_formulation(result, problem),
             _other_readings(result, problem, ordered),
         ]
-        if any(_deviations(result)):  # a table that is read wrongly makes no robot; of another one a frame may be wrong
+        if any(_deviations(result)):  # a misread table makes no robot; of another robot a frame may be wrong
             explanations.insert(0, explanations.pop())
         causes = first(computed_columns(problem), *explanations, _residual_causes(result, problem, ordered))
         ignored = result.record.details.get("ignored_joints")
@@ -623,10 +622,9 @@ def likely_causes(result: Outcome) -> list[str]:
 def _beside_a_good_fit(
     result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem, together: list[str], noticed: bool
 ) -> tuple[list[str], list[str]]:
-    """Return likely causes of what single rows or residuals show, and remarks: limits of the fit, slight effects.
+    """Return likely causes visible in single rows or residuals, and remarks: limits of the fit, slight effects.
 
-    ``together`` are sentences on rows that were left out next to each other, ``noticed`` is whether residuals are
-    beyond the noise.
+    ``together`` are sentences on excluded rows next to each other, ``noticed`` states that residuals exceed the noise.
     """
     kept, parts = kept_rows(result), of_sessions(ordered)
     causes = list(filled_rows(ordered.data))  # which may fit
@@ -719,14 +717,14 @@ def _held(result: Outcome, problem: CalibrationProblem) -> Iterator[str]:
 
 def _limited_by_formulation(result: Outcome, problem: CalibrationProblem) -> Iterator[str]:
     """Say that loss, penalty or constraints leave what a squared penalty at weight 1 explains of the same rows."""
-    if result.record.earlier:  # whose prior is what was known
+    if result.record.earlier:  # its prior is the earlier knowledge
         return
     kept = kept_rows(result)
-    if kept.mean() < 1 - EXCLUDED:  # downweighted by a fit that is wrong everywhere
+    if kept.mean() < 1 - EXCLUDED:  # downweighted in a fit that is wrong everywhere
         kept = np.ones_like(kept)
     rows, x = problem.on(problem.data.take(np.flatnonzero(kept))), result.x
     outliers = set() if result.squared_loss else {flag.label for flag in flagged(rows, ridge_deviations(rows))}
-    if outliers:  # they bias the squares with which the fit is compared, and losses that are not robust
+    if outliers:  # they bias the squares of the comparison, and losses that are not robust
         rows = rows.without(outliers)
     plain = _worst_ratio(rows, ridge_deviations(rows))
     if not 0 < plain <= NOISY:
@@ -738,7 +736,7 @@ def _limited_by_formulation(result: Outcome, problem: CalibrationProblem) -> Ite
     if away and not result.squared_loss:
         x = rows.parameters.free.scale * pose(result.formulation, rows.linearize(x)).solve(result.weight).z
     before, now = (_worst_ratio(rows, each) for each in (result.x, x))
-    if now < max(NOTICED * plain, before / NOISY):  # outliers limited it
+    if now < max(NOTICED * plain, before / NOISY):  # outliers limited the fit
         return
     names = [name_of(constraint, k) for k, constraint in enumerate(result.formulation.constraints)]
     beside = f" without outliers ({listed(away)})" if away else ""
@@ -790,12 +788,12 @@ def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
 
 def _other_readings(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> Iterator[str]:
     """Say what is wrong with single rows, and what explains all or some of them if they are read otherwise."""
-    if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
+    if len(problem.arms) > 1:  # a table is reinterpreted with the nominal model of one robot
         yield from rows_without_values(problem.data, problem.arms)
         return
     explained = max(ratio for _, ratio in residual_rms(result).values()) < NOTICED
-    most = REACH * arm_length(problem) if explained else np.inf  # else wrong lengths explain more
-    # beside single rows, which may be the ones where something changed
+    most = REACH * arm_length(problem) if explained else np.inf  # otherwise wrong lengths explain more
+    # in addition to single rows, at which something may have changed
     parts = of_sessions(ordered)
     yield from first(*(chain(single_rows(part), better_interpretations(part, most)) for part in parts))
 
@@ -805,7 +803,7 @@ def _residual_causes(result: Outcome, problem: CalibrationProblem, ordered: Cali
     if len(problem.arms) > 1:
         return
     error = rms(problem.errors(result.x)[kept_rows(result)])
-    beyond = error >= LARGEST["length"]  # what a robot's own effects may be
+    beyond = error >= LARGEST["length"]  # possible size of a robot's own effects
     outside = beyond_limits(problem.robot, all_q(problem.data), OUTSIDE)
     yield from first(
         (f"{text}: check the unit and the column of its values." for text in outside),
@@ -821,7 +819,7 @@ def _without_outliers(
 ) -> tuple[CalibrationProblem, Array]:
     """Return the rows without outliers, others with no larger errors, and the deviations (n,) [SI] that fit them.
 
-    Not ``again``: the result's own, where outliers are too small to matter.
+    Unless ``again``, it is the result's own fit if outliers are too small to matter.
     """
     kept = set(result.problem.labels) - {flag.label for flag in result.single}
     errors, own = ordered.errors(result.x), np.isin(ordered.labels, list(kept))
@@ -830,7 +828,7 @@ def _without_outliers(
     if not again or (result.squared_loss and not result.single):  # another loss may spread an outlier over all rows
         return alone, result.x
     x = ridge_deviations(alone)
-    for _ in range(OUTLIER_SEARCHES):  # they hide behind each other, and make good rows look like outliers
+    for _ in range(OUTLIER_SEARCHES):  # they mask each other, and make good rows look like outliers
         before, alone = alone, ordered.without({flag.label for flag in flagged(ordered, x)})
         if alone.labels == before.labels:
             break
@@ -855,9 +853,9 @@ def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Ite
 
 
 def _in_place_of_extensions(result: Outcome, alone: CalibrationProblem) -> Iterator[str]:
-    """Say what single change explains the rows better than the extensions of the model, which may take it up.
+    """Report a single change that explains the rows better than the model's extensions, which may have absorbed it.
 
-    -2 ln L, whose fall by them is known, falls by m ln(1 / part) with a change that leaves a part of m squares.
+    Their decrease of -2 ln L is known; a change that leaves a part of m squares decreases it by m ln(1 / part).
     """
     learned = result.learned
     if learned is None or not learned.added or not all(name.startswith(ARM) for name in learned.added):

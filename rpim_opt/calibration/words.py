@@ -24,8 +24,8 @@ from rpim_opt.problem.row_functions import masses_assumed
 from rpim_opt.robot.extensions import EXPECTED
 from rpim_opt.robot.parameters import EXPANSION, is_joint_offset, of_session, own_name
 
-MOST_ROWS, MOST_BOUNDS = 8, 5  # number of outliers and active bounds named individually
-LAST_DIGIT = 1e-4  # what tables of parameters show [mm, degree]
+MOST_ROWS, MOST_BOUNDS = 8, 5  # outliers and active bounds named individually
+LAST_DIGIT = 1e-4  # resolution of parameter tables [mm, degree]
 WHERE = {"position": "in position along each axis", "orientation": "in orientation", "joint": "at the joints"}
 """Wording of the components of the robot's repeatability."""
 DEFLECTIONS = {
@@ -35,13 +35,13 @@ DEFLECTIONS = {
     "moment": "deflection of links under gravity",
 }
 """Model extensions whose scales are reported as deflections, at the configuration where these are largest."""
-UNUSUAL = 10.0  # scales of its group beyond which a deviation is said to be unusual: 2 in 1000 are under Student's t_3
-MOST = 5  # unusual parameters and outliers that are named one by one
-VAGUE = 0.5  # standard deviation of the logarithm of a hyperparameter from which on only its upper bound is said
-REDUNDANT = 0.99  # correlation of two parameters from which on little more than a combination is known of them
-NEGLIGIBLE = 0.1  # share of the largest part of the repeatability below which another is not said
+UNUSUAL = 10.0  # scales of its group above which a deviation is called unusual: 2 in 1000 are under Student's t_3
+MOST = 5  # unusual parameters and outliers named individually
+VAGUE = 0.5  # standard deviation of ln(hyperparameter) above which only its upper bound is reported
+REDUNDANT = 0.99  # correlation of two parameters above which little more than a combination is known
+NEGLIGIBLE = 0.1  # share of the largest part of repeatability below which another is not reported
 TWO_SIDED, ONE_SIDED = 1.96, 1.645  # standard normal quantiles of intervals and of bounds with 95 % confidence
-MOST_POINTS = 20  # points of a table; of others one row says how many there are
+MOST_POINTS = 20  # rows of a table of points; one row counts the others
 HEADER = ["touches by point [mm]", "touches", "RMS, nominal", "RMS, identified", "max, identified"]
 
 
