@@ -275,7 +275,7 @@ class Outcome:
     def errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
         """Return the norm of every row's residual, (N,) [m], of the identification data by default.
 
-        ``dimension="angle"`` is the orientation error [rad], NaN for rows that are not poses; ``"pixel"`` that of images.
+        ``dimension="angle"`` is the orientation error [rad], NaN for rows without one; ``"pixel"`` an image error.
 
         >>> import rpim_opt as ro
         >>> instance = ro.load("pose")

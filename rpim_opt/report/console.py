@@ -51,7 +51,7 @@ def output_errors() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.filename is not None:  # a name that is too long, a folder without permission
+        if error.filename is not None:  # a name that is too long, or a folder without permission
             fail(f"{error.filename}: {error.strerror}.", 2)
         _close(sys.stdout)
         fail(f"The output cannot be written: {error}.", 2)

@@ -40,7 +40,7 @@ class Figure(NamedTuple):
     caption: str
 
 
-WIDTH, HEIGHT = 420.0, 270.0  # of a chart [px]; the page scales it to its place
+WIDTH, HEIGHT = 420.0, 270.0  # of a chart [px]; the page scales it
 INKED = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
 STYLE = {
     **dict.fromkeys(INKED, plot.COLORS["ink"]),
@@ -88,11 +88,11 @@ def render(
 
 
 COLUMNS = {"label": "check", "error_mm": "error [mm]", "sigmas": "standard deviations", "allowed_sigmas": "allowed"}
-"""What the page of checks calls columns of their table."""
+"""Column names of the page of checks."""
 
 
 def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
-    """Write checks over time, as `use.monitor` returns them: as HTML page that works offline, or as table (``.csv``).
+    """Write checks over time, as returned by `use.monitor`: an HTML page that works offline, or a table (``.csv``).
 
     The page has the verdict, two charts and every check; ``title`` names the robot or cell. The file is written whole
     or not at all. InputError for a name that ends in neither ``.html`` nor ``.csv``.

@@ -1,4 +1,4 @@
-"""Figures of a calibration on matplotlib axes: each is drawn on ``ax`` or on new axes, and these are returned.
+"""Figures of a calibration on matplotlib axes: each is drawn on ``ax`` or on new axes, and returns them.
 
 The report's charts are the same figures.
 """
@@ -29,23 +29,23 @@ __all__ = ["errors", "l_curve", "parameters"]
 
 Axes = Any  # matplotlib's, imported where axes are made
 COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "ink": "#59636e"}
-"""Colours by meaning, as in the page's style sheet, which has others in the dark."""
-CLOSE = 3.0  # ratio of an axis's ends below which a logarithmic one has ticks as a linear one has
-MANY_DOTS = 1000  # Dots beyond which they are one picture in a vector graphic.
+"""Colours by meaning, as in the page's style sheet, which has others for dark mode."""
+CLOSE = 3.0  # ratio of an axis's ends below which a logarithmic axis has ticks like a linear one
+MANY_DOTS = 1000  # Dots above which they become one bitmap in a vector graphic.
 FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 6.0
-"""Largest sizes of names along x and y, relative to the axis's label, and the smallest that can be read [points]."""
-LINE_HEIGHT = 1.25  # distance of names over their size
-MANY_ROWS = 100  # above it each row is a small point without a name
+"""Largest sizes of names along x and y, relative to the axis's label, and the smallest legible one [points]."""
+LINE_HEIGHT = 1.25  # line spacing of names over their size
+MANY_ROWS = 100  # above it, each row is a small point without a name
 TIMES = ((86400.0, "days"), (3600.0, "hours"), (1.0, "seconds"))  # units of an axis of time [s]
 CELLS, FAINT = 24, "#dce8f5"  # of a map: cells along the longer side, and the colour of the least value
 VIEWS = {"from above": (0, 1), "from the side": (0, 2)}  # axes to the right and up
-VANISHED = 1e-4  # penalties below this part of the median one are not drawn: a lasso has no deviation left there
+VANISHED = 1e-4  # penalties below this part of the median are not drawn: a lasso has no deviation left there
 
 
 def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
     """Draw every row's error [mm] before and after calibration; flagged rows of the identification data are marked.
 
-    The rows are those of the identification data, and the axes new ones, unless others are stated.
+    By default the rows are those of the identification data, and the axes are new.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
@@ -110,7 +110,7 @@ def parameters(result: Calibration, dimension: str = "length", ax: Axes = None) 
         ends = np.concatenate([-bound[bounded], bound[bounded]])
         at = np.tile(place[bounded], 2)
         ax.vlines(ends, at - 0.35, at + 0.35, color=COLORS["mark"], label="tolerance")
-    # an interval that ends far out would hide all others: it is cut at the edge
+    # a very long interval would hide all others: it is cut at the edge
     middle = np.median(np.abs(x) + spread) if len(x) else 0.0
     reach = 1.1 * max([1e-9, *np.abs(x), *bound[bounded], middle])
     cut = "\nIntervals beyond the axis are clipped." * bool((np.abs(x) + spread > reach).any())
@@ -142,7 +142,7 @@ def active_tolerance(result: Calibration) -> Array:
 def l_curve(of: Program | Calibration, ax: Axes = None) -> Axes:
     """Draw the L-curve: root of the penalty against root of the loss over the weight; that of a result is marked.
 
-    The program is solved at 200 weights where it has a closed form, else at 40; InputError without a penalty.
+    The program is solved at 200 weights with a closed form, otherwise at 40; InputError without a penalty.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)

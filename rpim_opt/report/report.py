@@ -45,15 +45,15 @@ from rpim_opt.use.validation import Validation
 
 MOST_FLAGGED = 200  # flagged rows that are named, the worst first
 L_CURVE_HEIGHT = 340.0  # [px], for the label of its axis
-WHY = {"learned": "maximum of the marginal likelihood"}  # reasons of choices that have no note; others were given
+WHY = {"learned": "maximum of the marginal likelihood"}  # reasons of choices without a note
 
 
 def write_report(calibration: Calibration, path: str | Path, new: Mapping[str, Validation] | None = None) -> None:
     """Write a calibration report: one HTML file that needs no network, written whole or not at all.
 
-    Verdict and headline come first, then `SECTIONS`. Every text of a user's file is shown as text. ``new`` are
-    `ro.use.validate`'s results of further measurements, by the names of their tables: headline and acceptance test are
-    by them. InputError where none is of a length.
+    Verdict and headline come first, then `SECTIONS`. Text from a user's file is shown as plain text. ``new`` maps names
+    of tables to `ro.use.validate`'s results on further measurements; headline and acceptance test then refer to them.
+    InputError if none has a length.
 
     >>> import rpim_opt as ro
     >>> ro.report.write_report(ro.calibrate("paper_arm"), "report.html")
@@ -68,9 +68,9 @@ class Content(NamedTuple):
     """A result, with evaluations that several sections share."""
 
     result: Calibration
-    accepted: Acceptance | None  # the least favourable test by new measurements, or that by the result's own
+    accepted: Acceptance | None  # the least favourable test by new measurements, or the result's own
     tested: str  # the new measurements of that test
-    errors: tuple[str, Array, Array]  # what the headline's rows are, and their errors (N,) [m], nominal and identified
+    errors: tuple[str, Array, Array]  # name of the headline's rows, and their errors (N,) [m], nominal and identified
     map: Workspace | None
     composition: list[str]
     new: Mapping[str, Validation]
@@ -85,7 +85,7 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     composition: list[str] = []
     if lacking := judged(result):
         composition = lacking.sentences()
-        if lacking.alarming:  # said at the top; otherwise it is a diagnosis
+        if lacking.alarming:  # shown at the top; otherwise it is a diagnosis
             warnings.insert(0, " ".join(composition))
             composition = []
     left_out = [str(row) for row in result.left_out]
@@ -97,11 +97,11 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     warnings = [f"New measurements, {name}: {each.failure}" for name, each in new.items() if each.failure] + warnings
     tests = {}
     for name, each in new.items():
-        with contextlib.suppress(InputError):  # no requirement; rows that are read in another way: a failure
+        with contextlib.suppress(InputError):  # no requirement, or rows with another interpretation: a failure
             tests[name] = accept(result, data=each.data)
     by, accepted = max(tests.items(), key=lambda of: FAVOURABLE.index(of[1].verdict), default=("", accepted))
     content = Content(result, accepted, by, _errors(result, new), workspace, composition, new)
-    headline = list(_headline(content))  # refuses rows without a length, before any figure is drawn
+    headline = list(_headline(content))  # raises for rows without a length, before any figure is drawn
     sections = [(name, list(section(content))) for name, section in SECTIONS]
     return render(
         f"Calibration: {heading}",
@@ -414,7 +414,7 @@ def _provenance(content: Content) -> Iterator[Block]:
     rows = []
     for what, of in blocks.items():
         sigmas = np.concatenate([np.sqrt(np.einsum("nii->ni", block.covariance)) for block in of])
-        components: dict[str, list[str]] = {}  # by their value, as a range where rows differ
+        components: dict[str, list[str]] = {}  # by value, as a range if rows differ
         for (name, dimension), each in zip(of[0].measurement.components.items(), sigmas.T, strict=True):
             unit, si = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3)}.get(dimension, ("", 1.0))
             low, high = each.min() / si, each.max() / si
@@ -459,7 +459,7 @@ def _regularization(content: Content) -> Iterator[Block]:
     """Yield the L-curve, and the choice of every rule."""
     result = content.result
     formulation = result.formulation
-    # with an earlier result as the prior, weight 1 joins two sets of data: no other weight has a meaning
+    # with an earlier result as prior, weight 1 combines two sets of data: no other weight has a meaning
     has_path = formulation.penalty is not None and formulation.solvable and not result.record.earlier
     if not has_path or not result.weight > 0:
         return

@@ -42,19 +42,19 @@ from rpim_opt.store import problem_file
 
 _Options = ParamSpec("_Options")
 ROLES = ("identification", "validation")
-UNSTATED = 1e-5  # standard deviation [m or rad] of what only validates, where none is stated: of a good machine tool
+UNSTATED = 1e-5  # standard deviation [m or rad] of validation data if none is stated: that of a good machine tool
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Instance(Tabled):
     """A calibration problem of a folder, with validation data and settings.
 
-    ``problem`` has robot, parameters and identification data; ``formulation``, ``weight`` (None where hyperparameters
-    are estimated), ``prior``, ``model`` and ``noise`` are as for `calibrate`. ``record`` is what a saved result has of
-    the data, with the validation data; ``published`` are mean errors [mm] that the source prints for the same table, by
-    role (identification, validation) and method; ``reference`` figures that a run must reproduce, by name, (value,
-    tolerance); ``held_out`` is whether the validation data were drawn from the same table: once they have validated,
-    all rows are used. ``constraints`` are the file's own, which hold beside every ready formulation.
+    ``problem`` has robot, parameters and identification data; ``formulation``, ``weight`` (None if hyperparameters are
+    estimated), ``prior``, ``model`` and ``noise`` are as for `calibrate`. ``record`` is the part of a saved result
+    about the data, with the validation data; ``published`` are mean errors [mm] printed by the source for the same
+    table, by role (identification, validation) and method; ``reference`` are figures that a run must reproduce, name to
+    (value, tolerance); ``held_out`` states that validation data were drawn from the same table: after validation all
+    rows are used. ``constraints`` are the file's, which apply in addition to every ready formulation.
     """
 
     problem: CalibrationProblem
@@ -87,7 +87,7 @@ class Instance(Tabled):
         """Return the calibration with the folder's settings and record.
 
         ``changes`` are arguments of `calibrate` to use instead: ``weight="reml"``, ``formulation="robust"``. The file's
-        constraints hold beside a ready formulation; a `Formulation` object states its own.
+        constraints also apply to a ready formulation; a `Formulation` object states its own.
         """
         if isinstance(changes.get("formulation"), str):
             ready = formulation_of(changes["formulation"])
@@ -106,11 +106,11 @@ def load(
     """Return the problem of a folder, or a shipped problem by name.
 
     ``name`` is a folder with ``problem.toml`` (its format: the guide "Your own robot"), that file, or the name of one
-    that comes with the package; ``variant`` one of the file's ``[variant.NAME]`` tables, laid over the other keys.
-    ``measurements`` are measurement models of your own that the file may name, ``model`` has terms of your own: the
-    file may identify and scale their parameters, its tables have the columns that they see. ``chain`` is one of the
-    file's ``[chain.NAME]`` tables alone; by default all of them are one problem. InputError names the file, the row or
-    key, what was found and what is accepted.
+    that comes with the package; ``variant`` is one of the file's ``[variant.NAME]`` tables, which replaces other keys.
+    ``measurements`` are user-defined measurement types that the file may name, ``model`` has user-defined terms: the
+    file may identify and scale their parameters, and its tables have their columns. ``chain`` is one of the file's
+    ``[chain.NAME]`` tables; by default all of them are one problem. InputError names the file, the row or key, what was
+    found and what is accepted.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm", variant="swap")  # the 16 points for the 9, and the other way round
@@ -134,7 +134,7 @@ def load(
         if not isinstance(table.repeatability, str):
             problem = problem.with_repeatability(Repeatability(**dict(table.repeatability)))
         if validation is not None:
-            problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
+            problem.on(validation)  # raises for rows that the problem's robot or reflectors cannot have
         formulation = _formulation(definition, problem)
         prior = problem_file.stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
         problem = problem.with_parameters(prior.where_known(problem.parameters, problem.parameters))
@@ -218,7 +218,7 @@ def _also_of_folders(
         if isinstance(problem, str | Path):
             problem = load(problem)
         if not isinstance(problem, Instance):
-            if not hasattr(problem, "parameters"):  # measurements alone, for instance
+            if not hasattr(problem, "parameters"):  # for instance measurements
                 accepted = "a problem, what `load` returns, or a problem's name or folder"
                 raise InputError("problem", f"a {type(problem).__name__}", accepted)
             return function(problem, *arguments, **options)
@@ -231,7 +231,7 @@ def _also_of_folders(
 calibrate = _also_of_folders(identify.calibrate)
 """Identify the parameters of a problem, an `Instance`, or one that `load` finds by its name or folder.
 
-Arguments and errors as for `calibration.calibrate`; what is not stated is as the instance has it.
+Arguments and errors are those of `calibration.calibrate`; those not given are the instance's.
 
 >>> import rpim_opt as ro
 >>> ro.calibrate("paper_arm").selector, ro.calibrate(ro.load("paper_arm"), weight="reml").selector
@@ -311,12 +311,12 @@ def _with_known(data: Dataset, table: problem_file.ProblemTable, role: str, path
         whole = with_known(data, known)
         blocks = [(block, block.touched) for block in whole.blocks if block.touched is not None]
         joined = {name for block, rows in blocks if not block.measurement.touching for names in rows for name in names}
-        touches: dict[str, list[tuple[str, bool]]] = {}  # label and whether a plane is touched, by what is
+        touches: dict[str, list[tuple[str, bool]]] = {}  # label and whether a plane is touched, by touched object
         for block, rows in blocks:
             for i, names in zip(block.row, rows, strict=True):
                 if block.measurement.touching:
                     touches.setdefault(names[0], []).append((whole.label[i], block.measurement.planar))
-        for name, those in touches.items():  # so few of a point or plane are not informative
+        for name, those in touches.items():  # so few touches of a point or plane are not informative
             label, planar = those[-1]
             least, column = (4, "plane") if planar else (2, "point")
             if len(those) < least - (name in joined):

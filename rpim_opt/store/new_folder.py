@@ -51,8 +51,8 @@ SHARED = (
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
 EXPORTED = re.compile(rb"calibrated (\d{4}-\d\d-\d\d, digest \w+)")  # in the notes of an exported file
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
-UNLIKE = 5.0  # ratio of the spreads of measured points and of the nominal flange from which on units are likely wrong
-UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above which they are the same mounting.
+UNLIKE = 5.0  # ratio of the spreads of measured points and nominal flange that suggests wrong units
+UPRIGHT = 0.9  # cosine of the angle between two gravity directions of the same mounting
 
 
 class Started(NamedTuple):
@@ -92,18 +92,18 @@ def new_problem(
 ) -> Started:
     """Make a problem folder that `load` reads, completely or not at all; with ``dry_run`` check all and write nothing.
 
-    ``folder`` is a new one, or for one more chain one whose problem file has chains of the same URDF. ``robot`` is the
-    name of a ready robot, or a file, ``data`` are text, Excel or Parquet files. ``measurement`` is what was measured,
-    by default poses, positions or distances, as the columns are; ``options`` are what is stated of the tables.
-    ``urdf_base`` and ``urdf_tip`` are links between which a URDF's robot is, ``dh`` the convention of a DH table,
-    ``"modified"`` or ``"standard"``, where it states none (`read_sheet`).
+    ``folder`` is new, or for a further chain one whose problem file has chains of the same URDF. ``robot`` is the name
+    of a ready robot, or a file; ``data`` are text, Excel or Parquet files. ``measurement`` is the measurement type, by
+    default poses, positions or distances, depending on the columns; ``options`` state how to read the tables.
+    ``urdf_base`` and ``urdf_tip`` are the links between which a URDF's robot is, ``dh`` is the convention of a DH
+    table, ``"modified"`` or ``"standard"``, if it states none (`read_sheet`).
 
-    ``validation`` is a table or several, or ``hold_out`` the part of the configurations that is drawn at random with
-    ``seed``. ``chain`` is the NAME of ``[chain.NAME]``, a problem on the origins of a URDF's joints; a chain that goes
-    up the tree through joints that move and down again always is one. ``target`` is what a camera sees: a table with
-    point, x_mm, y_mm, or a grid ``7x5,30mm``. ``understood`` is called with what was understood of the tables, before
-    anything is computed. Raises InputError for a folder that is there already, and whatever of the robot or the data
-    cannot be used, or may mean two things.
+    ``validation`` is a table or several; or ``hold_out`` is the part of the configurations that is drawn at random with
+    ``seed``. ``chain`` is the NAME of ``[chain.NAME]``, a problem on the origins of a URDF's joints, required for a
+    chain that goes up the tree through moving joints and down again. ``target`` is a camera's board: a table with
+    point, x_mm, y_mm, or a grid ``7x5,30mm``. ``understood`` is called with the interpretation of the tables before any
+    computation. InputError for a folder that exists already, and for a robot or data that cannot be used, or are
+    ambiguous.
 
     >>> import rpim_opt as ro
     >>> arm = ro.store.find_problem("paper_arm")
@@ -192,7 +192,7 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Interpretation, rows:
             "start again, use the robot's original file."
         )
     there = "the flange's origin"
-    if placed(arm.tool) != placed(np.zeros(6)):  # of a URDF, or a DH table in another convention than the modified one
+    if placed(arm.tool) != placed(np.zeros(6)):  # from a URDF, or a DH table in another convention than modified
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"
         there = f"{frame}, {placed(arm.tool)} in the flange frame"
     yield (
@@ -251,7 +251,7 @@ def _write_whole(folder: Path, contents: Mapping[str, bytes], arm: RobotSetup, s
         if chains:
             files.write_files({made / ROBOT_OF_CHAINS: files.read_bytes(source)})
         elif source.suffix == ".toml":
-            files.write_text(made / "robot.toml", files.read_text(source))  # with its comments
+            files.write_text(made / "robot.toml", files.read_text(source))  # with comments
         else:
             write_robot(arm.robot, made / "robot.toml")
         made.rename(folder)
@@ -265,9 +265,9 @@ def _rows(columns: Columns, chosen: np.ndarray) -> Columns:
 
 
 def stated_target(text: str, file: str = TABLES[-1]) -> tuple[Board, str, Columns]:
-    """Return the board of ``--target``, its line of a problem file, and the table to write if it is no grid.
+    """Return the board of ``--target``, its line of a problem file, and the table to write unless it is a grid.
 
-    That is called ``file`` in the folder. All are empty without a board.
+    The table is named ``file`` in the folder. All are empty without a board.
     """
     if not text:
         return {}, "", {}
@@ -302,7 +302,7 @@ def _kind(arm: RobotSetup, found: Interpretation, board: Board, measurement: str
         return kind, f"guessed: rows with the same {column} touched it, {count} in all, and nothing else is measured"
     if not kind.by_camera:
         return kind, f"guessed from the columns {', '.join(kind.columns)}"
-    misfit = {}  # RMS [m] of the views' poses where base and tool fit best, camera on the flange or beside the robot
+    misfit = {}  # RMS [m] of the views' poses with the best base and tool, camera on the flange or beside the robot
     for name, each in CAMERAS.items():
         data = read_data(on_board(found.columns, board), arm.robot, {"pixel_px": 1.0}, each)
         poses = with_poses(data, starting_cameras(data, {}))
@@ -334,7 +334,7 @@ def _problem_text(
     base, how = _base(arm, largest_session(rows) if apart else rows, tools, kind)
     parameters = starting_parameters(robot, rows, base, tools)
     names = list(identifiable("auto", robot, parameters, rows))
-    if apart:  # every session has a base of its own: one of all besides would be free
+    if apart:  # every session has its own base: a common one in addition would be undetermined
         names = [name for name in names if frame_of(name) != "base_"]
     if context["chain"] and markers == [""]:
         names = _at_the_ends(names, robot, base is not None)

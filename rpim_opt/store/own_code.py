@@ -44,7 +44,7 @@ def run_file(source: Path, name: str) -> ModuleType:
     if spec is None or spec.loader is None:
         raise InputError("the file", source.name, "a Python file", source)
     content = importlib.util.module_from_spec(spec)
-    sys.modules[name] = content  # where classes of the file look for their annotations
+    sys.modules[name] = content  # where classes of the file look up their annotations
     spec.loader.exec_module(content)
     return content
 
@@ -60,7 +60,7 @@ def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
         raise InputError(where, f"'{name}', but no file {source.name}", "a file beside this one: copy it there", file)
     try:
         content = run_file(source, f"rpim_opt_own.{module}")
-    except (Exception, SystemExit) as error:  # code of somebody else may raise anything
+    except (Exception, SystemExit) as error:  # foreign code may raise anything
         raise InputError(where, f"{type(error).__name__}: {error}", "code that runs without errors", source) from error
     named = getattr(content, attribute, None)
     if not isinstance(named, kind):

@@ -44,8 +44,8 @@ from rpim_opt.store.own_code import is_own, own_object
 Model = Literal["geometry", "auto"]
 Noise = Literal["robot", "free", "level", "declared"]
 PACKAGE = Path(__file__).resolve().parents[1]
-MEASURED = "measured"  # The place that every problem has: the configurations of its identification data.
-FIELDS = {  # keys of ``[record]``, and what a report calls them
+MEASURED = "measured"  # The predefined place of all problems: the configurations of the identification data.
+FIELDS = {  # keys of ``[record]``, and their names in reports
     "by": "Measured by",
     "when": "Measured",
     "where": "Place",
@@ -60,7 +60,7 @@ FIELDS = {  # keys of ``[record]``, and what a report calls them
     "ignored_joints": "Ignored joint values",
     "notes": "Notes",
 }
-LONGEST_TEXT = 1000  # Characters of a text that somebody may want to read.
+LONGEST_TEXT = 1000  # Characters of a text for readers.
 
 
 def problems_folder() -> Path:
@@ -77,7 +77,7 @@ def find_problem(name: str | Path) -> Path:
     if path.is_dir():
         return path
     known = sorted(p.name for p in problems_folder().iterdir() if (p / "problem.toml").is_file())
-    if name in known:  # a path is a folder's alone
+    if name in known:  # only folders are paths
         return problems_folder() / str(name)
     accepted = "a folder with problem.toml, or " + choices(str(name), known)
     raise InputError("the problem", f"no folder '{name}'", accepted)
@@ -342,10 +342,10 @@ def read_problem(
     path = inside(folder, "problem.toml", "the problem", folder)
     kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
     content = read_toml(path)
-    table, placed = _checked(content, kinds, path)  # the file itself must be right, whichever variant is requested
+    table, placed = _checked(content, kinds, path)  # the file itself must be valid, whichever variant is requested
     for where, overlays in {"variant": table.variant, "chain": table.chain}.items():
         for key, over in overlays.items():
-            if not any(map(is_own, _kinds_in(over))):  # whose code runs where it is requested
+            if not any(map(is_own, _kinds_in(over))):  # such code runs only when requested
                 _checked(_overlay(content, over), kinds, path, f"{where}.{key}")
     if variant is not None:
         content = _overlay(content, pick(table.variant, variant, "variant", path))
@@ -374,7 +374,7 @@ def read_problem(
     for each in file.observations:
         pick(kinds, each.measurement, "key measurement", path)
         inside(path.parent, each.identification, "key identification", path)
-        if each.validation:  # an empty one is how a variant has none
+        if each.validation:  # a variant clears it with an empty one
             inside(path.parent, each.validation, "key validation", path)
     return file
 
@@ -443,8 +443,8 @@ def stated_prior(
 ) -> Prior:
     """Return the prior of a problem file, checked against the problem's parameters.
 
-    A ``scale`` of joint offsets alone, or of a parameter by its name, is taken at its word: somebody has
-    thought of it, as of a certificate's standard uncertainty of a reflector's place.
+    A ``scale`` of joint offsets alone, or of a parameter by its name, is final, without the prior's factors: it was
+    stated deliberately, for instance from a certificate's standard uncertainty of a reflector's place.
     """
     for key in ("inflate", "without"):
         if key in table.model_fields_set and not table.earlier:

@@ -28,16 +28,16 @@ from rpim_opt.data.tables.understanding import CanonicalTable, Column, interpret
 from rpim_opt.problem.causes.misreadings import pose_misfit
 from rpim_opt.robot.chain import RobotSetup
 
-CLEARLY = 3.0  # The right reading of orientations, or mounting of a camera, leaves so many times less than another.
-ALIKE = 1.0  # Angle [deg] from the nominal robot's up to which targets have the orientation of their joint values.
+CLEARLY = 3.0  # Ratio of errors by which the right interpretation of orientations or camera mounting has to be better.
+ALIKE = 1.0  # Angle [deg] to the nominal orientation up to which targets agree with their joint values.
 USUAL = "extrinsic xyz"
-SINCE_1970 = 1e8  # times [s] that are larger; others may begin at zero in every file
+SINCE_1970 = 1e8  # larger times [s] count from 1970; others may start at zero in every file
 READINGS = {
     "quaternion": ORDERS,
     "rotation": (USUAL, "vector", *(f"intrinsic {''.join(order)}" for order in permutations("xyz") if order[0] != "z"),
                  "intrinsic zxy"),
 }  # fmt: skip
-"""Values of the option, which a check against the robot tries; extrinsic turns are intrinsic ones in reverse order."""
+"""Values of the option that a check against the robot tries; extrinsic orders are intrinsic ones in reverse."""
 Files = Sequence[tuple[Path | None, RawTable]]
 
 
@@ -45,9 +45,9 @@ Files = Sequence[tuple[Path | None, RawTable]]
 class Interpretation:
     """Interpretation of raw tables.
 
-    ``kind`` is what was measured, ``columns`` one table with our names (texts and numbers as the files have them),
-    ``raw`` the same rows with theirs, ``tables`` what was understood of every file, ``notes`` how they were joined and
-    what was checked, ``options`` what was stated of them, ``file`` the first of them.
+    ``kind`` is the measurement type, ``columns`` one table with canonical names (texts and numbers as in the files),
+    ``raw`` the same rows with the files' names, ``tables`` the interpretation of every file, ``notes`` state how they
+    were joined and what was checked, ``options`` the stated ones, ``file`` the first of the files.
     """
 
     kind: Measurement
@@ -84,7 +84,7 @@ class Interpretation:
             lines = ["   ".join(cell.ljust(w) for cell, w in zip(row, width, strict=True)).rstrip() for row in rows]
             title = [each.file] if len(self.tables) > 1 else []
             parts.append("\n".join([*title, *lines, *(f"{each.file}: {note}" for note in each.notes)]))
-        # on the flange or beside the robot: only what they fit tells
+        # on the flange or beside the robot: only the fit decides
         what = "pixels of a camera" if self.kind.by_camera else f"measurement {self.kind.name}"
         return "\n\n".join(parts) + "\n" + "\n".join([*self.notes, f"{self.count} rows, {what}."])
 
@@ -163,7 +163,7 @@ def _read(data: Sequence[Any], options: TableOptions, turned: Callable[[Grid], b
         path, sheet = Path(source), options.sheet if key in books or not books else ""
         try:
             tables.append((path, read_raw(path, replace(options, sheet=sheet.strip()), turned)))
-        except InputError as error:  # no sheet that is called as stated, commas and all: several
+        except InputError as error:  # no sheet of that name with commas: several sheets
             if error.where != "--sheet" or "," not in sheet:
                 raise
             parts = [replace(options, sheet=each.strip()) for each in sheet.split(",")]
@@ -197,7 +197,7 @@ def in_time_order(found: Interpretation) -> Interpretation:
     columns = {"label": [str(i + 1) for i in range(found.count)], **found.columns}
     unused = [each.column for table in found.tables for each in table.meant if not each.name]
     for name in (column for column in unused if time_column([column.lower()])):
-        with suppress(InputError, KeyError):  # no times, or not of all rows
+        with suppress(InputError, KeyError):  # no times, or not for all rows
             times = seconds(name, found.raw[name.lower()])
             if times.min() > SINCE_1970:
                 order = np.argsort(times, kind="stable").tolist()

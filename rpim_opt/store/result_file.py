@@ -51,24 +51,24 @@ Models = Model | Mapping[str, Model]
 SHARED = ("x", "weight", "selection", "converged", "message", "history", "certificate", "learned", "mapping")
 CONSTRAINED = ("active_bounds", "active_constraints", "moves", "shadow_prices")
 DERIVED = (*CONSTRAINED, "record", "causes")
-"""What a calibration and its file hold under the same name, and what a calibration derives of what it holds."""
-RELATIVE = 1e-4  # standard deviations of hardly identifiable directions differ by that much between processors
-ABSOLUTE = 1e-6  # Largest difference of a small figure [mm, deg] and the one that follows from the data.
+"""Fields that a calibration and its file share by name, and values that a calibration derives."""
+RELATIVE = 1e-4  # relative differences between processors in standard deviations of hardly identifiable directions
+ABSOLUTE = 1e-6  # Largest difference between a small figure [mm, deg] and the one recomputed from the data.
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "sum_squares": SQUARES, "sum": SUM, "max": LARGEST, "norm1": NORM1, "norm2": NORM2, "huber": huber,
     "prior_penalty": prior_penalty,
     **{name: getattr(constraints, name) for name in ("within_tolerance", "by_link", "by_kind", "at_nominal", "signed",
                                                      "equal", "in_ball", "differences", "parse")},
 }  # fmt: skip
-"""Functions of a formulation that a file names; those that make one are named in a list with their arguments."""
+"""Functions of a formulation that a file names; makers of functions are named in a list with their arguments."""
 
 
 def save_result(result: Calibration, path: str | Path) -> None:
     """Write a calibration to one JSON file, or ``result.json`` in a folder, which `load_result` reads.
 
-    The file is written completely or not at all. The calibration's record has title, validation data and input files.
-    The file states the verdict: if it was not computed before, likely causes of a bad fit are sought first, which
-    takes seconds. InputError for a `PartitionedProblem`, whose measurements the file cannot repeat.
+    The file is written completely or not at all. Title, validation data and input files are those of the calibration's
+    record. The file states the verdict; if it was not computed before, likely causes of a bad fit are sought first,
+    which takes seconds. InputError for a `PartitionedProblem`, whose measurements the file cannot hold.
     """
     if not result.problem.keeps_rows:
         raise InputError("save_result", "data in blocks", "data in memory, which the file repeats")
@@ -78,15 +78,14 @@ def save_result(result: Calibration, path: str | Path) -> None:
 def load_result(path: str | Path, measurements: Sequence[Measurement] = (), model: Models | None = None) -> Calibration:
     """Return the calibration that a file holds.
 
-    A digest shows whether anything was changed since it was written: by error, that is, and not by somebody who also
-    writes a new digest. The errors of all rows are recomputed and compared with those that the file states.
-    A formulation with functions of a script's own is there by its name: it cannot be solved again, everything else
-    works.
+    A digest shows accidental changes since the file was written; it does not protect against somebody who writes a new
+    digest. The errors of all rows are recomputed and compared with those in the file. A formulation with a script's
+    functions is restored by name only: it cannot be solved again, everything else works.
 
-    ``path`` is a file of `save_result`, or a folder with ``result.json``. ``measurements`` are measurement models of
-    your own that the file names, ``model`` has the terms of your own that the calibration had, of several robots also
-    by name: a file holds what the terms are called and no functions. They are checked by names, columns and the errors
-    of all rows. InputError names the file, the key, what was found and what is accepted.
+    ``path`` is a file of `save_result`, or a folder with ``result.json``. ``measurements`` are the user-defined
+    measurement types that the file names, ``model`` has the calibration's user-defined terms, for several robots also
+    by name: a file holds only their names, no functions. They are checked by names, columns and the errors of all rows.
+    InputError names the file, the key, what was found and what is accepted.
 
     >>> import rpim_opt as ro
     >>> ro.store.save_result(ro.load("paper_arm").calibrate(), "result.json")
@@ -122,11 +121,11 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
                     continue
                 accepted = f"{now.identified_mm} mm, which follows from the file's data, terms and measurement models"
                 raise InputError(f"key rows.{name}, row {before.label}", f"{before.identified_mm} mm", accepted)
-        result.outside(result.problem.data)  # ranges of earlier calibrations are of this robot's joints
+        result.outside(result.problem.data)  # ranges of earlier calibrations have to fit this robot's joints
     except InputError as error:
         raise error.within(path) from None
     except (TypeError, ValueError, LookupError, ArithmeticError, AttributeError, RuntimeError) as error:
-        # that somebody put together by hand, with a digest
+        # of a file put together by hand, with a digest
         found = f"inconsistent content ({type(error).__name__}: {error})"
         raise InputError("the file", found, "an unmodified file", path) from None
     return result
@@ -210,7 +209,7 @@ class Stored:
 
 def content(result: Calibration) -> dict[str, Any]:
     """Return the content of a result file: figures [mm, deg], the data they follow from [SI], and a digest."""
-    from rpim_opt.calibration.acceptance import accept  # few robots have to be accepted
+    from rpim_opt.calibration.acceptance import accept  # few robots have an acceptance test
 
     result = replace(result, record=result.record.dated(), known={**result.known, "causes": result.causes})
     functions = definition(result.formulation)
@@ -287,10 +286,10 @@ def _terms(model: Model, robot: Robot) -> list[OwnTerm]:
 
 def _inliers(result: Calibration) -> StoredInliers | None:
     """Return the equations that a script's loss kept; a ready loss recomputes them."""
-    if "inliers" in result.known:  # an earlier file said it
+    if "inliers" in result.known:  # stated in an earlier file
         return result.known["inliers"]
     inliers = None
-    with suppress(InputError):  # a loss that no squared one stands for
+    with suppress(InputError):  # a loss without a quadratic model
         inliers = result.program.inliers(result.z)
     if inliers is None:
         return None
@@ -354,17 +353,17 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
     rows, validation = data["identification"], data.get("validation")
     problem = CalibrationProblem(robots.get("", robots), file.model, rows, repeatability=file.repeatability)
     if validation is not None:
-        problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
+        problem.on(validation)  # raises for rows that the problem's robot or reflectors cannot have
     formulation = formulation_of(file.formulation, file.definition)
     program = pose(formulation, around(problem.linearize(file.x), file.x), file.forms)
     learned = file.learned if not file.record.earlier else None
-    weight: float | Selector | None = None  # estimated, as it was
+    weight: float | Selector | None = None  # estimated, as before
     if learned is None:
         weight = SELECTORS.get(file.selection.name, file.weight) if file.selection else file.weight
     extensions = "auto" if learned is not None and learned.trials else "geometry"
     again = partial(calibrate, formulation=formulation, weight=weight, model=extensions)
     known_already: dict[str, Any] = {"causes": file.causes}  # in place of what the calibration would compute
-    if not program.formulation.solvable:  # as a script's functions cannot be
+    if not program.formulation.solvable:  # as with a script's functions
         known_already |= {name: getattr(file, name) for name in (*CONSTRAINED, "inliers")}
         if file.inliers is not None:
             keep = np.ones(len(program.model.b), dtype=bool)
@@ -432,7 +431,7 @@ def _converter() -> Any:
     from cattrs.gen import make_dict_structure_fn, make_dict_unstructure_fn, override
 
     made = Converter(detailed_validation=False)
-    for kind in (bool, int, str):  # NumPy's, too
+    for kind in (bool, int, str):  # also NumPy's
         made.register_unstructure_hook(kind, kind)
     made.register_unstructure_hook(float, _spelled)
     made.register_structure_hook_factory(is_namedtuple, namedtuple_dict_structure_factory)
@@ -442,8 +441,8 @@ def _converter() -> Any:
     omitted = override(omit=True)
     by_name = override(unstruct_hook=lambda kind: kind.name, struct_hook=lambda name, _: name)
     fields: dict[type, dict[str, Any]] = {
-        Record: {"validation": omitted, "digest": omitted},  # among the data; of the file itself
-        Robot: {"model": omitted},  # functions of a script, who gives them again
+        Record: {"validation": omitted, "digest": omitted},  # stored with the data; computed from the file
+        Robot: {"model": omitted},  # a script's functions, given again by the user
         Block: {"measurement": by_name},
     }
     for kind, changes in fields.items():
@@ -470,7 +469,7 @@ def _listed(array: np.ndarray) -> Any:
 def _array(values: Any, kind: Any) -> np.ndarray:
     """Return lists as an array: of floats where the class has them, otherwise of integers, truth values or texts."""
     if kind is not np.ndarray:
-        return np.array(values, dtype=float)  # reads "nan" and "inf", too
+        return np.array(values, dtype=float)  # also reads "nan" and "inf"
     array = np.array(values)
     if not array.size:
         return array.astype(int)

@@ -27,11 +27,11 @@ from rpim_opt.robot.parameters import Parameters, model_parameters
 from rpim_opt.store.problem_file import Observation, ProblemFile, place_fixtures, read_problem
 
 Columns = dict[str, list[str]]
-MOST = 1_000_000  # configurations of a table
-TORQUE = 20.0  # Simulated joint torques are uniform up to this [Nm].
+MOST = 1_000_000  # largest number of configurations of a table
+TORQUE = 20.0  # Simulated joint torques are uniform between plus and minus this [Nm].
 DIGITS, EXACT_DIGITS, CAMERA_DIGITS = 4, 9, 5
-"""Of joint values in degrees or millimetres; where the noise is in them none may come from rounding."""
-PREFIXES = ("", "to_")  # What precedes the columns of the points of a row.
+"""Decimals of joint values in degrees or millimetres; for joint noise so many that rounding adds none."""
+PREFIXES = ("", "to_")  # Prefixes of the columns of a row's points.
 Place = Annotated[list[float], Field(min_length=3, max_length=3)]
 Pixels = Annotated[int, Field(gt=0)]
 
@@ -67,10 +67,10 @@ class Simulation(Table):
 def write_simulation(name: str | Path, seed: int | None = None, out: Path | None = None) -> list[Path]:
     """Write the tables of a problem folder that has a ``[simulation]`` table (the guide "The command line").
 
-    They go into the folder, or into another, with ``truth.toml``: true deviations and labels of blunders. The files are
-    returned. True deviations are normal with the scales as standard deviations, times ``spread``, for every identified
-    parameter; those of ``[simulation.truth]`` are fixed instead. Joint values are uniform in ``joint_share`` of
-    the limits. Identification data carry the declared noise, validation data none. The tables need not exist yet.
+    They are written to the folder, or to ``out``, with ``truth.toml``: true deviations and labels of blunders. Return
+    the files. True deviations of identified parameters are normal with the scales as standard deviations, times
+    ``spread``; those in ``[simulation.truth]`` are fixed. Joint values are uniform in ``joint_share`` of the limits.
+    Identification data have the declared noise, validation data none. The tables need not exist.
     """
     definition = read_problem(name)
     if not definition.table.simulation:
@@ -89,7 +89,7 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
     blunders: list[str] = []
     for role, count in (("identification", plan.configurations), ("validation", plan.validation)):
         with in_file(definition.path):
-            # drawn where no table of that role is, too: other tables of the same seed stay as they are
+            # drawn even without a table of that role: other tables of the same seed do not change
             q = random_candidates(definition.robot, 2 * count, rng, plan.joint_share)
         for each, of in zip(definition.observations, fixtures, strict=True):
             file = getattr(each, role)
@@ -120,7 +120,7 @@ def _parameters(stated: ProblemFile) -> tuple[list[tuple[str, ...]], Parameters]
     """Return the fixtures of every observation, and the parameters that the file identifies."""
     fixtures: list[tuple[str, ...]] = []
     none = np.empty(0, dtype=int)
-    blocks = []  # without rows, for every measurement and fixture: what has parameters of its own
+    blocks = []  # without rows, for every measurement and fixture with own parameters
     for each in stated.observations:
         kind = stated.kinds[each.measurement]
         places = [stated.placed.get(name.partition("_")[0], {}) for name in kind.parameters]
@@ -170,7 +170,7 @@ class _Table:
         constraint = not kind.columns  # configurations on a plane or sphere
         columns |= self._joints(q, EXACT_DIGITS if constraint else DIGITS, torque)
         values = np.zeros((len(rows), len(kind.columns)))
-        values[:, [i for i, name in enumerate(kind.columns) if name == "qw"]] = 1.0  # no turn
+        values[:, [i for i, name in enumerate(kind.columns) if name == "qw"]] = 1.0  # no rotation
         data = self._read({**columns, **self._values(values)})
         problem = CalibrationProblem(self.stated.robot, self.parameters, data)
         if constraint:
@@ -186,7 +186,7 @@ class _Table:
                 values[block.row] = kind.plus(block.y, errors)
         if not self.noisy or not self.plan.blunders:
             return columns | self._values(values), []
-        # moved by the length of a blunder, in random directions
+        # displaced by the length of a blunder, in random directions
         hit = self.rng.choice(len(values), self.plan.blunders, replace=False)
         lengths = [i for i, dimension in enumerate(kind.columns.values()) if dimension == "length"]
         direction = self.rng.normal(size=(len(hit), len(lengths)))
@@ -205,8 +205,8 @@ class _Table:
             residual[np.concatenate([block.row for block in blocks])] = posed.residual(self.x)
             return (residual - wanted[rows])[:, None]
 
-        target = Target(problem.robot, away, damping=1e-20)  # more would change the last digits of tables
-        # a generator of its own: draws of other tables do not depend on how many are needed
+        target = Target(problem.robot, away, damping=1e-20)  # larger damping would change the last digits of tables
+        # its own generator: draws of other tables do not depend on the number needed
         q, beyond = target.reached(len(wanted), self.rng.spawn(1)[0], self.plan.joint_share)
         if beyond is not None:
             found = "a plane or sphere out of reach"
@@ -285,7 +285,7 @@ class _Table:
         if bool(points) == bool(planes):
             raise InputError("table simulation", "points_mm and planes", "one of them, for both tables")
         things = {name: np.tile(np.array(place, dtype=float) / 1e3, (each, 1)) for name, place in points.items()}
-        for name, square in planes.items():  # places that are uniform on it
+        for name, square in planes.items():  # positions uniform on it
             normal = np.array(square.normal, dtype=float)
             normal /= np.linalg.norm(normal)
             axis = np.eye(3)[int(np.argmin(np.abs(normal)))]

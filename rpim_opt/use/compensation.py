@@ -34,24 +34,24 @@ from rpim_opt.robot.parameters import reflectors, tool_prefix
 from rpim_opt.use.reading import Targets
 from rpim_opt.use.sessions import base_frame, in_session, session_notes
 
-SMALLEST = 1e-12  # correction [rad or m] below which nothing is corrected
-BLOCK = 8192  # rows that are worked on together, so that what they need stays in the processor's cache
-REACHED = 1e-7  # A target counts as reached when no more than this is left [m, rad]
+SMALLEST = 1e-12  # smaller corrections [rad or m] are zero
+BLOCK = 8192  # rows processed together, so that their data fit into the processor's cache
+REACHED = 1e-7  # remaining error [m, rad] of a reached target
 EXPANDED = 2.0  # coverage factor of the expanded uncertainty that is compared with errors and the limit
-BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
+BESIDE = 0.05  # distance [m] between a stated position and its joint values that is reported
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
-FIRST = np.array([1, 1, 1, 1e-3, 1e-3, 1e-3])  # weights [m/rad] of an error with which the position comes first
-STILL = 1e-9  # weight [m^2/rad^2] of the joints' motion there: no singular wrist swings to keep an orientation
-KEPT = np.array([1, 1, 1, 1e-4, 1e-4, 1e-4])  # `REACHED` is 1e-7 m, and 1 mrad where orientations are kept
-NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
-BANK = 2000  # configurations among which starts of a pose without one are sought
-INSIDE, ANYWHERE = 48, 12  # how many it tries in the measured joint ranges, and then within limits
-NULL_SPACE_WEIGHT = 1e-10  # weight of a correction that moves nothing, relative to the largest squared singular value
+FIRST = np.array([1, 1, 1, 1e-3, 1e-3, 1e-3])  # weights [m/rad] of an error if position has priority
+STILL = 1e-9  # weight [m^2/rad^2] of joint motion then: a singular wrist does not swing for an orientation
+KEPT = np.array([1, 1, 1, 1e-4, 1e-4, 1e-4])  # `REACHED` is 1e-7 m, and 1 mrad if orientations are kept
+NO_NOISE = 1e-18  # variance [m^2, rad^2] of unmeasured orientations: a reading needs a covariance
+BANK = 2000  # configurations among which start values are sought for a pose without one
+INSIDE, ANYWHERE = 48, 12  # start values tried in the measured joint ranges, then within limits
+NULL_SPACE_WEIGHT = 1e-10  # weight of a correction in the null space, relative to the largest squared singular value
 STEP_TOLERANCE = 1e-10
 DECREASE_TOLERANCE = 1e-6
-"""A row has converged when its step is shorter [rad or m], or lowers the objective by a smaller part."""
+"""A row has converged when its step is shorter [rad or m], or decreases the objective by a smaller relative amount."""
 MAX_ITERATIONS = 50
-MOVED = 6  # targets from which on one motion of all of them is significant
+MOVED = 6  # targets needed for a significant common motion
 WEIGHED = "a calibration with compliances identified from torques of gravity, or a term that depends on the payload"
 
 
@@ -60,23 +60,23 @@ class Compensation:
     """Corrected joint commands of a ``robot`` for N targets, and their errors by the calibrated model.
 
     ``nominal`` and ``q`` (N, dof) are the commands of the nominal controller and the corrected ones [rad or m].
-    ``position_before`` and ``position_error`` (N,) [m] are by how much these miss the target, both by the calibrated
-    model, of which the solution leaves nothing where the target is attainable; ``orientation_before`` and
-    ``orientation_error`` [rad] likewise, NaN where orientations do not count. ``std`` (N,) [m] is the standard
-    uncertainty of the position in the instrument's frame, sqrt(tr J C J' + tr R), with the covariance C of all
-    identified parameters, those of the base included, their Jacobian J and the repeatability R; infinite without C.
-    ``orientation_std`` (N,) [rad] is that of the orientation, with R where orientations were measured.
+    ``position_before`` and ``position_error`` (N,) [m] are their distances from the target by the calibrated model, the
+    latter zero if the target is attainable; ``orientation_before`` and ``orientation_error`` [rad] likewise, NaN if
+    orientations are not compensated. ``std`` (N,) [m] is the standard uncertainty of the position in the instrument's
+    frame, sqrt(tr J C J' + tr R), with the covariance C of all identified parameters including the base, their Jacobian
+    J and the repeatability R; infinite without C. ``orientation_std`` (N,) [rad] is that of the orientation, with R if
+    orientations were measured.
 
-    ``status`` of a row is ``"ok"`` (at most 0.1 um and 0.1 urad are left, 1 mrad where orientations are kept),
-    ``"limited"`` (by a joint limit), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found)
-    or ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where the position
-    error and its expanded uncertainty (k = 2) together exceed ``limit`` [m]. An ``"ok"`` row is ``"extrapolated"``
-    beyond the measured joint ranges; ``outside`` are all rows there. ``note`` says why a robot is not delivered, how
-    joints count whose signs or zeros were estimated, and of which session the instrument's frame is; ``point`` which
-    point is moved, and why orientations are not corrected; ``source`` names the calibration; ``texts`` are columns of
-    the targets' table that are carried through. ``beside`` (N,) [m] is how far a stated position is from that of the
-    nominal robot at the joint values stated beside it, NaN where there are none. ``std_after_motion`` is the RMS [m] of
-    the standard uncertainties that one motion of all targets leaves, NaN for fewer than `MOVED` of them.
+    ``status`` of a row is ``"ok"`` (at most 0.1 um and 0.1 urad remain, 1 mrad if orientations are kept), ``"limited"``
+    (by a joint limit), ``"unreachable"`` (also for the nominal robot; the command is the nearest found), ``"near
+    singular"`` (the correction would be too large, and was damped) or ``"above the limit"`` (the sum of position error
+    and expanded uncertainty, k = 2, exceeds ``limit`` [m]). An ``"ok"`` row is ``"extrapolated"`` beyond the measured
+    joint ranges; ``outside`` are all rows there. ``note`` states why a robot is not delivered, how joints with
+    estimated signs or zeros count, and the session of the instrument's frame; ``point`` the point that is moved, and
+    why orientations are not corrected; ``source`` names the calibration; ``texts`` are further columns of the targets'
+    table. ``beside`` (N,) [m] is the distance of a stated position from the nominal robot's at the joint values stated
+    with it, NaN without these. ``std_after_motion`` is the RMS [m] of the standard uncertainties left by one motion of
+    all targets, NaN for fewer than `MOVED` of them.
     """
 
     robot: Robot
@@ -158,9 +158,9 @@ class Compensation:
 
     @property
     def missed(self) -> list[str]:
-        """The labels of rows that miss their target: unreachable, or error and uncertainty are above the limit.
+        """The labels of rows that miss their target: unreachable, or with error and uncertainty above the limit.
 
-        Without a limit an error counts that exceeds twice its standard uncertainty.
+        Without a limit, rows count whose error exceeds twice its standard uncertainty.
         """
         far = np.isin(self.status, (UNREACHABLE, ABOVE))
         if not np.isfinite(self.limit):
@@ -251,40 +251,40 @@ def compensate(
 
         |p|^2 + |w|^2 + D' P D
 
-    where p [m] and w [rad] are the identified robot's errors of position and orientation. With fewer than six joints
-    only those rotations count that need not move the point. With the singular values s of the Jacobian at q, P is zero
-    but where the exact correction e / s of an error e would be longer than ``largest`` (near singular): there it is
-    (e / largest)^2 - s^2, so that the part (s largest / e)^2 is made; and, slightly, where nothing moves (more joints
-    than needed), so that the correction is the shortest to first order.
+    where p [m] and w [rad] are the identified robot's errors of position and orientation. With fewer than six joints,
+    only rotations that do not move the point count. With the singular values s of the Jacobian at q, P is zero unless
+    the exact correction e / s of an error e would be longer than ``largest`` (near singular): there it is (e /
+    largest)^2 - s^2, which makes the part (s largest / e)^2 of the correction. In the null space of redundant joints P
+    is small and positive, so that the correction is the shortest to first order.
 
-    **Which frame.** What a calibration identified of the base is where the instrument stands and is not compensated:
-    targets hold in the base as identified. A turn of joint 1 and one of the base are the same to the data; what the
-    scales ascribe to the base stays. With ``base=True`` targets hold in the base as stated, and the robot corrects for
-    its place, too (with ``base = "auto"`` that of registration).
+    **Which frame.** The identified base is the place of the instrument and is not compensated: targets hold in the base
+    as identified. Data do not distinguish a rotation of joint 1 from one of the base; the part that the scales assign
+    to the base stays. With ``base=True`` targets hold in the base as stated, and the robot also corrects for its place
+    (with ``base = "auto"`` that of registration).
 
     **Targets.** ``q`` (N, dof) are commands of the nominal controller [rad or m], ``poses`` targets in the base, (N, 7)
-    x, y, z [m] and unit quaternion, w first, or (N, 3) positions. With both, ``q`` is where to look for the poses;
-    without ``q`` every pose is looked for from several configurations that come near, in the measured joint ranges, and
-    where none of these leads to it within the limits. ``label`` names the rows, ``robot`` is which of several.
+    x, y, z [m] and unit quaternion, w first, or (N, 3) positions. With both, ``q`` are start values for the poses;
+    without ``q`` several configurations near a pose are tried as start values, in the measured joint ranges, then
+    within the limits. ``label`` names the rows, ``robot`` is one of several.
 
-    **Orientation.** Position comes first: where this leaves some of p, |w|^2 counts 1e-6 m^2 instead, and |D|^2 1e-9
-    m^2 rad^-2. So it does for all targets where the standard uncertainty of one's orientation is larger than its w, as
-    where positions of one reflector hardly determine it; w is then the turn by which the correction changes it: rows of
-    a program would turn against each other. ``orientation=True`` corrects all orientations, at the cost of positions
-    where both cannot be had; with ``False`` those of targets are ignored.
+    **Orientation.** Position has priority: if some of p remains, |w|^2 counts 1e-6 m^2 instead, and |D|^2 1e-9 m^2
+    rad^-2. The same applies to all targets if the standard uncertainty of any orientation exceeds its w, since
+    positions of one reflector hardly determine it; w is then the change of orientation by the correction, so that rows
+    of a program do not rotate relative to each other. ``orientation=True`` corrects all orientations, at the cost of
+    positions if both are unattainable; with ``False`` orientations of targets are ignored.
 
-    **Tool.** Both robots have the same tool, so that no difference of tools is compensated: ``tool`` (6,) in the flange
-    frame, x, y, z [m], roll, pitch, yaw [rad], the controller's TCP, or by default the reflector of the calibration
-    (``marker`` of several) as identified. The flange frame is that of the DH table, after the last joint.
+    **Tool.** Both robots have the same tool, so that differences of tools are not compensated: ``tool`` (6,) in the
+    flange frame, x, y, z [m], roll, pitch, yaw [rad], the controller's TCP, or by default the identified reflector of
+    the calibration (``marker`` of several). The flange frame is that of the DH table, after the last joint.
 
-    **Loads.** Joints are in the middle of their backlash. ``torque`` (N, dof) [Nm] is required, and zero if need be,
-    where compliances were identified from measured ones; ``payload`` [kg], one or (N,), and ``payload_centre`` (3,) in
-    the flange frame [m] where they were identified without, by default as the problem states them.
+    **Loads.** Joints are in the middle of their backlash. ``torque`` (N, dof) [Nm], possibly zero, is required if
+    compliances were identified from measured torques; otherwise ``payload`` [kg], a number or (N,), and
+    ``payload_centre`` (3,) in the flange frame [m] may be stated, by default those of the problem.
 
-    ``largest`` is the largest correction of a joint [rad or m], ``limit`` [m] what the position error left by the model
-    and its expanded uncertainty (k = 2) may be together, by default that of the record's requirement. A calibration
-    that is not delivered, or that its acceptance test rejects, raises NotDelivered unless ``despite_verdict``;
-    InputError for shapes that do not fit, numbers that are not finite, an unknown reflector.
+    ``largest`` is the largest correction of a joint [rad or m], ``limit`` [m] bounds the sum of the remaining position
+    error and its expanded uncertainty (k = 2), by default that of the record's requirement. NotDelivered for a
+    calibration that is not delivered, or that its acceptance test rejects, unless ``despite_verdict``; InputError for
+    shapes that do not fit, numbers that are not finite, and an unknown reflector.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
@@ -350,7 +350,7 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
     aims = on_all_cores(cell.aim, blocks)
     every = range(len(blocks))
     vague, why = 0, ""
-    if choice:  # a row that is turned alone would be turned against the others
+    if choice:  # all rows are treated alike: they must not rotate relative to each other
         vague = sum(on_all_cores(lambda i: cell.vague(blocks[i], aims[i]), every))
         why = " Orientations of all targets are corrected."
     parts = on_all_cores(lambda i: cell.corrected(blocks[i], aims[i], largest, not vague, choice), every)
@@ -401,11 +401,11 @@ def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
 # --- the controller's robot beside the identified one ------------------------------------------------------
 
 Aim = tuple[Array, Array, Array, Array, Array]
-"""Of N targets: commands (N, dof) of the nominal controller, poses (N, c), loads (N, l), errors (N, k), `beside`."""
+"""For N targets: nominal commands (N, dof), poses (N, c), loads (N, l), errors (N, k), and `beside`."""
 
 
 class _Cell:
-    """The controller's robot, the identified one, and the uncertainty of where that is.
+    """The controller's robot, the identified one, and the uncertainty of its position.
 
     Both are functions of joint values, loads and targets (`pose_function`).
     """
@@ -451,7 +451,7 @@ class _Cell:
         p = replace(p, nominal=p.nominal.copy(), identified=p.identified.copy())
         p.nominal[at], x[at] = place, 0.0
         p.identified[at] &= tool is None
-        # places (n,) of the robot's identified parameters among all of them
+        # indices (n,) of the robot's identified parameters among all
         self.own = whole.free.places_of(which)[p.identified[whole.identified[whole.places_of(which)]]]
         values = p.values(x)
         nominal, identified = (dict(zip(p.names, of.tolist(), strict=True)) for of in (p.nominal, values))
@@ -501,9 +501,9 @@ class _Cell:
         return int(np.count_nonzero(is_reached(missed, attainable(J)) & ~known))
 
     def corrected(self, targets: Targets, aim: Aim, largest: float, turning: bool, choice: bool) -> dict[str, Array]:
-        """Return the fields of a `Compensation` for some targets, with their orientations or, not ``turning``, without.
+        """Return the fields of a `Compensation` for some targets, with orientations if ``turning``.
 
-        Of a ``choice`` positions come first. ``there`` (N, 3) are the positions of uncorrected commands.
+        With ``choice`` positions have priority. ``there`` (N, 3) are the positions of uncorrected commands.
         """
         commands, target, load, missed, beside = aim
         pose_before, before, J = self.identified(commands, load, target)
@@ -528,7 +528,7 @@ class _Cell:
         limits = np.array([np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)])
         corrected, left, active = nearest(self.identified, load, wanted, commands, limits, W, P)
         first = np.flatnonzero((choice and turning) & reached & (norms(left)[0] > REACHED))
-        if len(first):  # the whole pose cannot be had
+        if len(first):  # the whole pose is unattainable
             there = load[first], wanted[first], commands[first], limits[:, first], counts[first] * FIRST, still[None]
             corrected[first], left[first], active[first] = nearest(self.identified, *there)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
@@ -545,7 +545,7 @@ class _Cell:
     def uncertainty(self, q: Array, targets: Targets, moved: Array | None = None) -> tuple[Array, Array]:
         """Return sqrt(tr (J C J' + R)) (N,) of position [m] and orientation [rad] reached at q, under their loads.
 
-        Of positions, what one motion of all of them leaves, where they are ``moved`` (N, 3) with it.
+        With ``moved`` (N, 3), that of positions is what one motion of all of them leaves.
         """
         N, k = len(q), len(self.kind.components)
         if self.fit_covariance is None:
@@ -589,10 +589,10 @@ class _Cell:
         return found(np.arange(len(poses)), best, attainable(self.nominal(best, load, poses)[2]), limits)[0]
 
     def _trials(self, poses: Array, loads: int) -> list[tuple[Array, Array]]:
-        """Return configurations (N, dof) near every pose, and the box (2, dof) to go on in.
+        """Return configurations (N, dof) near every pose, and the box (2, dof) for the iterations.
 
-        First `INSIDE` in the measured joint ranges, with half of what they may be exceeded by: the other half is for
-        the correction; then `ANYWHERE` within limits, or a turn.
+        First come `INSIDE` in the measured joint ranges extended by half of the allowed excess, which leaves the other
+        half to the correction; then `ANYWHERE` within limits, or one revolution.
         """
         low, high = self.robot.limits.T
         low = np.where(np.isfinite(low), low, np.minimum(high, np.pi) - 2 * np.pi)
@@ -606,7 +606,7 @@ class _Cell:
             reached = self.nominal(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
             distance = scipy.spatial.distance.cdist(poses[:, :3], reached[:, :3], "sqeuclidean")
             if poses.shape[1] == 7:
-                distance += 8 * (1 - np.abs(poses[:, 3:] @ reached[:, 3:].T))  # the angle's square, nearly
+                distance += 8 * (1 - np.abs(poses[:, 3:] @ reached[:, 3:].T))  # approximately the squared angle
             closest = np.argpartition(distance, count, axis=1)[:, :count]
             order = np.argsort(np.take_along_axis(distance, closest, axis=1), axis=1)
             starts = bank[np.take_along_axis(closest, order, axis=1)]
@@ -654,7 +654,7 @@ def pose_function(
     configuration = loads.configuration(robot.joint_types, nominal.__getitem__, command)
     flange = chain(robot.joint_types, configuration, value, robot.model.terms)
     T = product([ca.SX(ca.DM(before)), *flange, *kinematics.placed([value(tool + c) for c in FRAME])])
-    # how point and orientation of T move with the joints; gravity bends a joint by the values of all of them
+    # motion of T's point and orientation by the joints; gravity deflects a joint depending on all joint values
     turn = sum(ca.skew(T[:3, k]) @ ca.jacobian(T[:3, k], command["q"]) for k in range(3)) / 2
     J = ca.vertcat(ca.jacobian(T[:3, 3], command["q"]), turn)[: len(kind.components), :]
     modelled = kind.model(T)
@@ -674,8 +674,8 @@ def nearest(
     """Minimize |W error|^2 + D' P D over low <= q <= high, q = start + D, row by row.
 
     Gauss-Newton steps in the box, damped (Levenberg-Marquardt) in rows whose step does not lower the objective.
-    Shapes: start (N, n), limits (N, n) or (n,), W (N or 1, k, k), P (N or 1, n, n). Returned are joint
-    values (N, n), their errors (N, k), and which joints are at an active limit (N, n).
+    Shapes: start (N, n), limits (N, n) or (n,), W (N or 1, k, k), P (N or 1, n, n). Return joint values (N, n), their
+    errors (N, k), and whether joints are at an active limit (N, n).
     """
     N, n = start.shape
     W = np.broadcast_to(W, (N, *W.shape[1:]))
@@ -707,11 +707,11 @@ def nearest(
             break
         g = descent(left)
         H = A[left].transpose(0, 2, 1) @ A[left] + P[left]
-        diagonal = np.einsum("nii->ni", H)  # a trace of damping keeps every one regular
+        diagonal = np.einsum("nii->ni", H)  # damping by the trace makes every one regular
         diagonal += damping[left, None] * diagonal + 1e-14 * diagonal.mean(axis=1, keepdims=True) + 1e-300
         step = _boxed(H, g, to_low[left] - D[left], to_high[left] - D[left])
         new = state(left, D[left] + step)
-        better = new[-1] <= value[left] * (1 + 1e-14) + 1e-20  # below that it is rounding
+        better = new[-1] <= value[left] * (1 + 1e-14) + 1e-20  # smaller differences are rounding
         rows = left[better]
         D[rows] += step[better]
         for old, values in zip(here, new, strict=True):
@@ -727,9 +727,9 @@ def nearest(
 
 
 def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:
-    """Return steps d (N, n) that minimize d'Hd/2 - g'd within low <= 0 <= high, nearly.
+    """Return approximate minimizers d (N, n) of d'Hd/2 - g'd within low <= 0 <= high.
 
-    Entries that leave the box are set on its border and the others solved for again, until none leaves.
+    Entries outside the box are set to its boundary and the others solved for again, until all are inside.
     """
     n = g.shape[1]
     free = ~(((low >= 0) & (g < 0)) | ((high <= 0) & (g > 0)))
@@ -753,8 +753,8 @@ def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:
 def attainable(J: Array) -> Array:
     """Return matrices W (N or 1, k, k) that project errors on the attainable ones, from Jacobians (N, k, n).
 
-    With six joints or more, or positions alone, all do. With fewer position comes first: of the orientation counts what
-    can be turned without moving the point, which makes as many equations as joints.
+    With six joints or more, or positions only, all errors are. With fewer, position has priority: of the orientation
+    count rotations without motion of the point, which gives as many equations as joints.
     """
     k, n = J.shape[1:]
     if n >= k or k == 3:

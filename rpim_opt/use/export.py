@@ -43,13 +43,13 @@ from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, ref
 from rpim_opt.use.compensation import tool_uncertainty, turns_measured
 from rpim_opt.use.sessions import base_frame, in_session, session_notes
 
-OF_BYTES = "surrogateescape"  # files of other tools keep their encoding
+OF_BYTES = "surrogateescape"  # other tools' files keep their encoding
 WRITER = "rpim_opt: "
 EARLIER = re.compile(rf"^(?:# {WRITER}[^\n]*|<!-- {WRITER}.*?-->)\r?\n", re.MULTILINE)
-"""Comments of what was exported to a file before."""
-ANOTHER_MODEL = 0.01  # lengths of a robot that are off its model's by more [m] are another model's, d1 another base's
+"""Comments of an earlier export in a file."""
+ANOTHER_MODEL = 0.01  # larger differences of lengths [m] mean another model, of d1 another base
 FLANGE = "the flange frame (after the last joint; alpha and a in the last row of a DH sheet follow it)"
-CONVENTION = {  # what is said of a table in a convention
+CONVENTION = {  # description of a table in a convention
     "modified": "modified DH (Craig), Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta). For the "
     "standard convention (Paul) write a .csv with --dh standard",
     "standard": "standard DH (Paul, Hayati), Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta), from "
@@ -66,14 +66,14 @@ class Exported(NamedTuple):
 
 
 Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
-"""A file, and the function that writes to a path and returns notes for the user."""
+"""A file, and a function that writes to a path and returns notes for the user."""
 
 
 def identified(result: Calibration, marker: str | None = None, robot: str = "") -> RobotSetup:
     """Return the identified robot, its base in the instrument's frame, and a reflector as tool.
 
-    ``marker`` names the reflector, the first by default, ``robot`` is which of several. Refused are parameters that no
-    description of a robot holds (`beyond_geometry`), unknown markers and unknown robots.
+    ``marker`` names the reflector, by default the first, ``robot`` is one of several. InputError for parameters that no
+    description of a robot can hold (`beyond_geometry`), unknown markers and unknown robots.
 
     >>> import rpim_opt as ro
     >>> arm = ro.use.identified(ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml))
@@ -101,10 +101,10 @@ def identified(result: Calibration, marker: str | None = None, robot: str = "") 
 
 
 def beyond_geometry(result: Calibration) -> dict[str, float]:
-    """Return the values [SI] of the parameters that no description of a robot holds, by name: those of terms.
+    """Return the values [SI] of the parameters that no description of a robot can hold, by name: those of terms.
 
-    Ratios (but of joints that follow others: files hold their multipliers), harmonics, backlash, compliances, bends,
-    terms of a user's own; and origins, which only a URDF holds.
+    These are ratios (except of mimic joints, whose multipliers files hold), harmonics, backlash, compliances, bends,
+    and user-defined terms; also origins, which only a URDF holds.
     """
     p = result.problem.parameters
     beyond = {name: x for name, x in p.by_name(result.x).items() if of_term(name) or name in p.terms}
@@ -133,25 +133,25 @@ def export_files(
 ) -> Exported:
     """Export the identified robot to files of other tools: all of them, or none.
 
-    Of a calibration with more than geometry `geometry_alone` is written, its transmission errors beside it.
+    For a calibration with more than geometry `geometry_alone` is written, with its transmission errors in
+    ``corrections``.
 
     ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS), ``ur_calibration`` (``calibration.conf``) and
-    ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot to correct, which go to ``out``, of several
-    a folder. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`), ``robodk`` (.csv, four
-    numbers per joint, modified) and ``corrections`` are files to write, the last one the transmission errors, without a
-    row where the model has none: ``joint``, ``angle_deg`` (the controller's), ``correction_mrad``, to be subtracted
-    from a command, and ``std_mrad``.
-    ``marker`` is the reflector, ``robot`` which of several (`together`).
+    ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot that are corrected and written to ``out``, a
+    folder for several. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`), ``robodk`` (.csv,
+    four numbers per joint, modified) and ``corrections`` are files to write. The last one has the transmission errors
+    (no rows if the model has none): ``joint``, ``angle_deg`` (the controller's), ``correction_mrad``, to be subtracted
+    from a command, and ``std_mrad``. ``marker`` is the reflector, ``robot`` one of several (`together`).
 
-    ``root`` and ``tip``, links of the URDF between which the robot is, are by default those that it was read between.
-    The tip link stays where the file has it behind the last joint, unless ``tip_measured``: the reflector is its
-    origin, which goes to its identified place. Where origins were identified, those of all chains are written, and ends
-    of one are refused.
+    ``root`` and ``tip`` are the links of the URDF between which the robot is, by default those with which it was read.
+    The tip link keeps its place in the file behind the last joint, unless ``tip_measured``: then the reflector is its
+    origin and is moved to its identified place. If origins were identified, those of all chains are written, and
+    ``root`` and ``tip`` are refused.
 
-    A robot that is neither accepted nor rejected, or less certain than the nominal one is accurate, is written with the
-    note that this is inconclusive. Raises NotDelivered for a calibration that is not delivered, or rejected by the
-    requirement of its record, unless ``despite_verdict``, noted in every file; InputError where there is nothing
-    to write, or a file cannot hold what was identified.
+    A robot that is neither accepted nor rejected, or whose uncertainty exceeds the nominal one's error, is written with
+    the note that this is inconclusive. NotDelivered for a calibration that is not delivered, or rejected by the
+    requirement of its record, unless ``despite_verdict``, which every file notes; InputError if there is nothing to
+    write, or if a file cannot hold the identified parameters.
     """
     whole = in_session(result, robot)
     result, lost = geometry_alone(whole)
@@ -220,10 +220,10 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
 
 
 def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
-    """Return the calibration without what is `beyond_geometry`, but for origins, and a sentence on the accuracy lost.
+    """Return the calibration without parameters `beyond_geometry`, except origins, and a sentence on the accuracy lost.
 
-    The geometry of the whole model is not the best one without extensions and terms of a user's own: the same rows are
-    calibrated once more, also those that only they explain. Returned as it is where they are zero.
+    The geometry of the full model is not optimal without extensions and user-defined terms: the same rows are
+    calibrated again, including those that only they explain. Returned unchanged if these parameters are zero.
     """
     every = beyond_geometry(result)
     beyond = {name: every[name] for name in every if not own_name(name).startswith(OF_JOINTS)}
@@ -246,14 +246,14 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         stated = bare(result.stated).without(left_out)
         try:
             alone = result.calibrate_again(stated, model="geometry")
-        except (InputError, ValueError) as error:  # of functions of a user's own
+        except (InputError, ValueError) as error:  # raised by user-defined functions
             where = f"formulation '{result.formulation.name}'"
             found = f"no fit without {listed(lost, 6)}, which files cannot hold: {str(error).rstrip('.')}"
             raise InputError(where, found, "functions that do not use them") from error
         if isinstance(stated, CalibrationProblem) and alone.learned is not None and alone.left_out:
             again = calibrate(alone.problem.on(stated.data), alone.formulation, weight=alone.weight)
             alone = replace(again, learned=replace(alone.learned, left_out=()))
-    else:  # a prior of all its parameters, in units of their scales: as it is, with what is beyond geometry at zero
+    else:  # a prior of all parameters, in units of their scales: unchanged, with those beyond geometry at zero
         among = np.eye(len(free))[:, ~np.isin(free, list(beyond))]
         form = replace(result.formulation, penalty=lambda z: penalty(among @ z))
         alone = calibrate(bare(result.problem), form, weight=result.weight)
@@ -325,7 +325,7 @@ def _write_urdf(
 ) -> list[str]:
     """Write the identified origins, and base and tool if they belong to the file; return where root and reflector are.
 
-    An identified base near the file's root is the same frame, known better, and is written.
+    An identified base near the file's root is the same frame, measured more accurately, and is written.
     """
     of = {own_name(name): x for name, x in zip(result.problem.parameters.free.names, result.x, strict=True)}
     if any(name.startswith(OF_JOINTS) for name in of):
@@ -374,7 +374,7 @@ def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: 
     blocks = [block for block in problem.data.blocks if block.q.shape[2] == problem.robot.dof]
     q = np.concatenate([block.q[:, 0] for block in blocks])
     position, turn = (float(each.max()) for each in tool_uncertainty(result, q, tool, marker, robot))
-    if not (position or turn):  # nothing identified moves it
+    if not (position or turn):  # no identified parameter moves it
         return []
     if not np.isfinite([position, turn]).all():
         return ["URDF: the pose of its tip link is undetermined: check position and orientation by other means."]
@@ -456,9 +456,9 @@ def _of_controller(result: Calibration, marker: str | None, arm: RobotSetup) -> 
 
 
 def _on_base(arm: RobotSetup, nominal: Robot, of_file: Robot, file: Path) -> tuple[RobotSetup, list[str]]:
-    """Return an identified robot with its base where a file has it on axis 1, and a sentence if that was elsewhere.
+    """Return an identified robot with its base moved along axis 1 as in a file, and a sentence if it was elsewhere.
 
-    A URDF may begin with the table that the robot stands on: theta1 and d1 of the nominal robot count from there.
+    A URDF may start at the table below the robot: theta1 and d1 of the nominal robot count from there.
     """
     away = nominal.mdh[0, 2:4] - of_file.mdh[0, 2:4]
     theta, d = np.where(np.abs(away) > ANOTHER_MODEL, away, 0.0)
@@ -476,8 +476,8 @@ def _on_base(arm: RobotSetup, nominal: Robot, of_file: Robot, file: Path) -> tup
 def _write_camera(result: Calibration, source: Path, target: Path) -> None:
     """Write a camera's YAML of ROS with the calibrated intrinsics, everything else as in ``source``.
 
-    The projection matrix keeps its rectification: focal lengths are multiplied, and the centre moved, as those of the
-    camera matrix. Refused are calibrations of no camera, or of several, and files without one of the three lists.
+    The projection matrix keeps its rectification: its focal lengths and centre change like those of the camera matrix.
+    InputError for calibrations of no camera or of several, and files without one of the three lists.
     """
     p = result.problem.parameters
     cameras = {name.rpartition("_")[0] for name in p.names if own_name(name).startswith("camera_")}
@@ -511,7 +511,7 @@ def _yaml_list(text: str, key: str, shape: tuple[int, ...], path: Path) -> tuple
 def noted(content: bytes, ending: str, notes: Sequence[str]) -> bytes:
     """Return the content of a file with notes: comments, a column of CSV, or the key ``source`` of JSON.
 
-    Comments of an earlier calibration, which was exported to the file before, go: its frames are others.
+    Comments of an earlier export are removed: its frames are different.
     """
     text = EARLIER.sub("", content.decode("utf-8-sig", OF_BYTES))
     notes = ["".join(character if character.isprintable() else " " for character in each) for each in notes]

@@ -17,11 +17,11 @@ from rpim_opt.basics.units import LARGEST, UNITS, parse_units, split
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.names import recognize
 
-CYCLES, POSES = 30, 5  # how often the standard has how many poses approached
+CYCLES, POSES = 30, 5  # cycles and poses of the standard
 ANGLES = ("a", "b", "c")  # the standard's names of the rotations
 AXES = ("x", "y", "z")
 ROTATIONS = (("rx", "ry", "rz"), ANGLES, ("w", "p", "r"))
-"""What the three angles of a table may be called; each is judged by itself, whichever axis it turns about."""
+"""Possible names of three angles; each is evaluated separately, whatever its axis."""
 DIMENSIONS = dict.fromkeys(AXES, "length") | {stem: "angle" for group in ROTATIONS for stem in group}
 ACCEPTED = "pose, x_mm, y_mm, z_mm; with a command command_x_mm, ...; with an orientation rx_deg, ry_deg, rz_deg"
 
@@ -30,10 +30,10 @@ ACCEPTED = "pose, x_mm, y_mm, z_mm; with a command command_x_mm, ...; with an or
 class Performance(Tabled):
     """Accuracy and repeatability at the poses of a table.
 
-    ``poses`` has one row per pose: its name ``pose``, ``cycles`` (approaches), and by name [mm, mrad] the distance of
-    the barycentre of the attained positions from the command, ``AP_p_mm``, its parts ``AP_x_mm``, ..., None where no
-    command is known, and the positioning repeatability ``RP_l_mm``. Where orientations were measured, it has of each
-    angle, as the table calls it, mean less command and 3 standard deviations, ``AP_a_mrad`` and ``RP_a_mrad``.
+    ``poses`` has one row per pose: its name ``pose``, ``cycles`` (approaches), and by name [mm, mrad] the distance
+    ``AP_p_mm`` of the barycentre of attained positions from the command, its components ``AP_x_mm``, ..., None without
+    command, and the positioning repeatability ``RP_l_mm``. If orientations were measured, it has for each angle, by its
+    name in the table, mean minus command and 3 standard deviations, ``AP_a_mrad`` and ``RP_a_mrad``.
     """
 
     poses: tuple[Mapping[str, Any], ...]
@@ -109,13 +109,13 @@ def iso9283(
         S_l  = sqrt(sum (l_j - mean(l))^2 / (n - 1))
         RP_l = mean(l) + 3 S_l                RP_a = 3 S_a,  and the same for b and c
 
-    (ISO 9283:1998, 7.2.1 and 7.2.2.) Attained positions are those that the instrument reads: measurement noise is in
-    them. Angles count within half a turn of the command, or of the first approach.
+    (ISO 9283:1998, 7.2.1 and 7.2.2.) Attained positions are readings and contain measurement noise. Angles are taken
+    within half a turn of the command, or of the first approach.
 
-    ``pose`` are N names of the pose that a row approaches, ``position`` and ``command`` (N, 3) attained and commanded
-    positions [m] in one frame, ``angles`` and ``command_angles`` (N, 3) the same of the orientation [rad], three angles
-    that are called ``names``. Without commands there is no accuracy. InputError for shapes that do not fit, a pose that
-    is approached once, or whose command changes.
+    ``pose`` are N names of the approached poses, ``position`` and ``command`` (N, 3) attained and commanded positions
+    [m] in one frame, ``angles`` and ``command_angles`` (N, 3) the same for orientations [rad], three angles named
+    ``names``. Without commands there is no accuracy. InputError for shapes that do not fit, and a pose that is
+    approached once, or whose command changes.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -178,8 +178,8 @@ def read_approaches(source: Any, units: str = "") -> Performance:
 
     ``source`` is a text, Excel or Parquet file, or columns by name: ``pose``, attained ``x_mm, y_mm, z_mm``, commanded
     ``command_x_mm, ...`` (or Nominal X, Target X, ...), and angles ``rx_deg, ry_deg, rz_deg`` likewise. ``units`` are
-    those of columns whose name carries none, ``"deg,mm"``. InputError for columns that are missing or without unit,
-    cells that are no numbers, and what `iso9283` refuses.
+    those of columns whose name has none, ``"deg,mm"``. InputError for missing columns, columns without unit, cells that
+    are not numbers, and as for `iso9283`.
 
     >>> import rpim_opt as ro
     >>> columns = {"pose": ["P1", "P1"], "X [mm]": [1.0, 3.0], "Y [mm]": [0.0, 0.0], "Z [mm]": [0.0, 0.0]}
@@ -191,7 +191,7 @@ def read_approaches(source: Any, units: str = "") -> Performance:
     columns = read_raw(Path(source)).columns if isinstance(source, str | Path) else read_columns(source)
     stated = parse_units(units)
     poses: dict[str, str] = {}
-    attained: dict[str, tuple[str, float]] = {}  # name and unit [SI] of the columns of coordinates and angles
+    attained: dict[str, tuple[str, float]] = {}  # name and size in SI of the units of coordinates and angles
     commanded: dict[str, tuple[str, float]] = {}
     for name in columns:
         stem, unit = split(name)

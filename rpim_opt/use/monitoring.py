@@ -26,25 +26,25 @@ from rpim_opt.robot.parameters import own_name
 from rpim_opt.use import recalibration
 from rpim_opt.use.sessions import registered_again, set_ups
 
-TESTS = 3  # each check alone, their sum, and every parameter: each may err by a third of `recalibration.FALSE_ALARM`
-MOMENTS = 40  # checks before which a change is looked for first; of more so many, and all around the best of a cause
-SMALLEST = 1e-12  # probabilities are taken as no smaller: 7 standard deviations
-ALLOWANCE = 0.5  # CUSUM's reference value k, taken off every deviate: sums answer fastest to a shift of twice as much
+TESTS = 3  # single checks, their sum, and parameters: each may err by a third of `recalibration.FALSE_ALARM`
+MOMENTS = 40  # checks at which a change is first tried if there are more, then all near the best of a cause
+SMALLEST = 1e-12  # lower bound on probabilities: 7 standard deviations
+ALLOWANCE = 0.5  # CUSUM's reference value k, subtracted from every deviate: fastest for a shift of twice its size
 CELLS = 150  # steps of a sum's range in the Markov chain of its distribution
 HIGHEST_LIMIT = 50.0
-SET_UP_ANEW = 3.0  # factor by which errors are smaller if every set-up is registered again, from which on they moved
-NEARLY = 0.9  # part of chi-squared that a change explains beyond its linearization, as of a base that is elsewhere
-MOTION = 1.0  # standard deviation of a motion that the checks alone tell [m, rad]
+SET_UP_ANEW = 3.0  # factor of errors without over with registration of every set-up, from which set-ups have moved
+NEARLY = 0.9  # share of chi-squared explained beyond linearization, for instance by another place of the base
+MOTION = 1.0  # prior standard deviation of a motion determined from the checks [m, rad]
 
 
 class Drift(NamedTuple):
     """A change during checks."""
 
     cause: recalibration.Cause
-    first: int  # check after it
+    first: int  # first check after it
     steady: bool  # from the first check to the last
-    moved: recalibration.Moved | None  # by how much a single parameter moved in all; None for a frame
-    others: tuple[str, ...] = ()  # that explain the checks as well
+    moved: recalibration.Moved | None  # total movement of a single parameter; None for a frame
+    others: tuple[str, ...] = ()  # causes that explain the checks equally well
 
     def content(self) -> dict[str, Any]:
         """Return it as a document [mm, deg]."""
@@ -54,15 +54,15 @@ class Drift(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Monitoring:
-    """N checks of a robot in the order of time, against what its calibration predicts.
+    """N checks of a robot in order of time, compared with the predictions of its calibration.
 
-    ``times`` are their times as the table states them and ``when`` (N,) in s; empty and None without. ``error`` (N,)
-    are the errors against the calibration [m]; ``sigmas`` (N,) the innovation of a check, beyond the calibration and
-    the checks before it, in standard deviations of a new reading, and ``allowed`` (N,) the limit that one of all N
-    rarely exceeds; ``sums`` (N,) their cumulative sum (CUSUM) and ``limit`` what it rarely exceeds. ``drift`` is the
-    change that explains them best, None where chance does; ``wrong`` are readings that are better explained by an error
-    of their own, and left out of sums and changes; ``mistake`` is a likely one in the checks, in a sentence;
-    ``registered`` states the motions of checks that were registered again.
+    ``times`` are their times as in the table and ``when`` (N,) in s; empty and None if unknown. ``error`` (N,) are the
+    errors of the calibration [m]; ``sigmas`` (N,) the innovation of a check, beyond the calibration and previous
+    checks, in standard deviations of a new reading, and ``allowed`` (N,) a limit that any of all N rarely exceeds;
+    ``sums`` (N,) their cumulative sum (CUSUM) and ``limit`` its limit. ``drift`` is the change that explains them best,
+    None if chance does; ``wrong`` are readings that an error of their own explains better, left out of sums and
+    changes; ``mistake`` is a sentence on a likely mistake in the checks; ``registered`` states the motions of
+    registered checks.
     """
 
     label: tuple[str, ...]
@@ -178,15 +178,14 @@ def monitor(
 ) -> Monitoring:
     """Compare checks over time with the predictions of a calibration, singly and by their cumulative sum.
 
-    A check is judged by the prediction interval of a new reading, given the calibration and all checks before it; the
-    innovations are summed up (Page's CUSUM); and every parameter and frame is tried as one that moved, at once before
-    some check or steadily. A robot that does not drift raises a false alarm with probability 0.01 in all.
+    A check is judged by the prediction interval of a new reading, given the calibration and all previous checks; the
+    innovations are accumulated (Page's CUSUM); and a change of every parameter and frame is tried, either before some
+    check or steady. The total probability of a false alarm for a robot without drift is 0.01.
 
-    The result has a squared penalty or none. ``data`` are check readings in the instrument's frame of the calibration,
-    in the order of ``when`` (N,) [s] if that is stated; ``times`` are their N texts. If they ``register``, each of
-    their `set_ups` may be in a frame of its own: its motion is unknown in all tests, and takes six equations of them.
-    InputError for times that are not one a check, sessions whose registration is unknown, and a result that has no
-    covariance (lasso).
+    The result has a squared penalty or none. ``data`` are check readings in the calibration's instrument frame, in the
+    order of ``when`` (N,) [s] if stated; ``times`` are N texts. With ``register``, each of their `set_ups` may be in a
+    frame of its own: its motion is unknown in all tests, which costs six equations. InputError if there is not one time
+    per check, for sessions with unknown registration, and for a result without covariance (lasso).
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
@@ -212,7 +211,7 @@ def monitor(
     drift, wrong = _drift(result, problem, own, level)
     right = ~np.isin(data.label, [label for cause in wrong for label in cause.members])
     held = held_out_errors(result, data)
-    if unknown := unregistered(result, data, held):  # which a change of the robot would take up
+    if unknown := unregistered(result, data, held):  # which would appear as a change of the robot
         raise InputError("the checks", unknown.partition(":")[0].replace("The", "the", 1), "--register")
     return Monitoring(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
@@ -251,15 +250,15 @@ def _innovations(
 ) -> tuple[Array, Array, np.ndarray]:
     """Return innovations of N checks in standard deviations, as standard normal deviates, and their equations (N,).
 
-    The calibration's error is common to all predictions. A Kalman filter takes that away as checks show it, so that
-    the innovations of a robot that does not drift are independent::
+    The calibration's error is common to all predictions. A Kalman filter estimates it from the checks, so that the
+    innovations of a robot without drift are independent::
 
         e = r - J m,    S = J C J' + V,    K = C J' S^-1,    m + K e,    C - K J C
 
-    with |S^-1/2 e| in standard deviations, V the covariance of a reading, and C what calibration and earlier checks
-    leave open. Deviates are by Fisher's F, positive where a check misses more than usual. The filter learns nothing
-    from a check that is less probable than ``level``. What nothing before tells of a check, as of the first ones of a
-    set-up, of which ``own`` (s, N) has the rows, is no equation.
+    with |S^-1/2 e| in standard deviations, V the covariance of a reading, and C the remaining covariance after
+    calibration and earlier checks. Deviates are from Fisher's F, positive if a check misses more than usual. A check
+    less probable than ``level`` does not update the filter. Components that nothing earlier predicts, as in the first
+    checks of a set-up with rows ``own`` (s, N), are no equations.
     """
     C = result.known_covariance
     if C is None:
@@ -312,7 +311,7 @@ def cusum_limit(count: int, level: float) -> float:
         """Return by how much the probability of an alarm exceeds the level."""
         width = limit / CELLS
         centre = width * (np.arange(CELLS) + 0.5)
-        # from sum i the next is in cell j where u - ALLOWANCE is within half a cell of their difference; zero is a cell
+        # from sum i to cell j if u - ALLOWANCE is within half a cell of their difference; zero is a cell
         states = np.concatenate([[0.0], centre])
         upper = ndtr(np.concatenate([[0.0], centre + width / 2])[None, :] - states[:, None] + ALLOWANCE)
         step = np.diff(upper, axis=1, prepend=0.0)
@@ -322,15 +321,15 @@ def cusum_limit(count: int, level: float) -> float:
 
 
 Explained = tuple[float, Drift]
-"""An explanation of checks, after the logarithm of its probability."""
+"""Logarithm of the probability of an explanation of checks, and the explanation."""
 
 
 class _Explanations:
-    """Changes before a check or steadily from the first to the last, and single readings that are wrong.
+    """Changes before a check or steadily from the first to the last, and single wrong readings.
 
-    Set-ups of which ``own`` (s, N) has the rows may have moved beside. A frame may have moved whether it was identified
-    or not: else the robot's parameters are blamed for it. Rows of one configuration were read together, at the time of
-    the first of them.
+    Set-ups with rows ``own`` (s, N) may have moved in addition. A frame may have moved even if it was not identified:
+    otherwise its motion would appear as a change of the robot. Rows of one configuration count as read together, at the
+    time of the first.
     """
 
     def __init__(self, result: Calibration, problem: CalibrationProblem, own: Array, bent: bool) -> None:
@@ -405,7 +404,7 @@ class _Explanations:
 
 
 def _likeliest(found: Iterable[Explained]) -> Explained:
-    return max(found, key=lambda each: each[0])  # as `update` has it: p-values favour few parameters
+    return max(found, key=lambda each: each[0])  # as in `update`: p-values favour few parameters
 
 
 def _drift(
@@ -413,13 +412,13 @@ def _drift(
 ) -> tuple[Drift | None, tuple[recalibration.Cause, ...]]:
     """Return the change that explains checks best, set-ups moved or not, and the readings that are wrong by themselves.
 
-    None, or none, where chance explains them, over all that were tried.
+    None and an empty tuple if chance explains the checks, considering all causes that were tried.
     """
     explanations = _Explanations(result, problem, own, False)
     found = [_explained(explanations, level, True)]
-    if not found[-1].enough:  # many readings may be a change
+    if not found[-1].enough:  # many wrong readings may be a change
         found.append(_explained(explanations, level, False))
-    if not found[-1].enough:  # and many a link
+    if not found[-1].enough:  # and several changes one of a link
         found.append(_explained(_Explanations(result, problem, own, True), level, False))
     best = max(found, key=lambda each: (each.log, each.drift is not None))
     return best.drift, best.wrong
@@ -435,9 +434,9 @@ class _Explanation(NamedTuple):
 
 
 def _explained(explanations: _Explanations, level: float, single: bool) -> _Explanation:
-    """Return what explains checks, unless ``single`` a change at first, beside which readings may be wrong.
+    """Return the explanation of checks; unless ``single``, first a change, together with which readings may be wrong.
 
-    The probability is zero where more of them than `recalibration.SPARED` would be.
+    Its probability is zero if more than `recalibration.SPARED` of the readings would be wrong.
     """
     kept = np.ones((len(explanations.A), 1))
     wrong: list[recalibration.Cause] = []

@@ -58,9 +58,9 @@ def read_targets(
 
     Columns are joint values (``q1_deg``, ...), positions in the robot's base (``x_mm, y_mm, z_mm``), with
     ``qw, qx, qy, qz``, ``rx_deg, ry_deg, rz_deg`` or ``r11`` to ``r33`` poses, or both: joint values are then where to
-    look for those of the pose. Optional: ``label``, torques ``tau1_Nm``, ..., ``payload_kg``. ``source`` and
-    ``options`` are as for `read_measurements`, ``tool`` and ``marker`` as for `compensate`: turns that are only in
-    another convention those of the joint values beside them are refused.
+    start values for those of the pose. Optional: ``label``, torques ``tau1_Nm``, ..., ``payload_kg``. ``source`` and
+    ``options`` are as for `read_measurements`, ``tool`` and ``marker`` as for `compensate`: orientations that agree
+    with the joint values beside them only in another convention are refused.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
@@ -91,7 +91,7 @@ def _targets(robot: Robot, understanding: Interpretation) -> Targets:
     stems = {split_unit(name)[0] for name in columns}
     joints = not stems.isdisjoint(f"q{i}" for i in range(1, robot.dof + 1))
     oriented = not stems.isdisjoint({"qw", "rx", "r11"})
-    positions = oriented or not stems.isdisjoint("xyz")  # without x, y, z an orientation is refused as half a pose
+    positions = oriented or not stems.isdisjoint("xyz")  # an orientation without x, y, z is refused: half a pose
     if any(each.doubt == "quaternion" for each in understanding.tables):
         raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
     if "rx_rad" in columns and not joints and any(each.doubt == "rotation" for each in understanding.tables):
@@ -127,7 +127,7 @@ class Measured(NamedTuple):
     data: Dataset
     left_out: tuple[str, ...]
     notes: tuple[str, ...]
-    clock: tuple[str, tuple[str, ...]]  # name and cells of the column called time, timestamp or date, or none
+    clock: tuple[str, tuple[str, ...]]  # name and cells of a column time, timestamp or date
 
     @property
     def when(self) -> Array | None:
@@ -146,10 +146,10 @@ def read_measurements(
 
     Rows that state no uncertainty have that of the calibration's data.
 
-    ``source`` is a text, Excel or Parquet file, a data frame, or a list of them, which are stacked or joined;
-    ``measurement`` which of the calibration's measurement types, where it has several. ``options`` are what is stated
-    of the tables; what is not, is as it was for the calibration's own. Where the instrument was moved since then, rows
-    ``register``: they are those after the motion that fits them best (`registered_again`), which the notes state.
+    ``source`` is a text, Excel or Parquet file, a data frame, or a list of these, which are stacked or joined;
+    ``measurement`` is one of the calibration's measurement types if it has several. ``options`` not stated are those of
+    the calibration's own tables. If the instrument was moved since, ``register`` returns the rows after the motion that
+    fits them best (`registered_again`), which the notes state.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
@@ -171,7 +171,7 @@ def read_measurements(
     stems = {split_unit(name)[0] for name in columns}
     kind = calibrated
     if not kind.stands_in(stems):
-        # a part of what was calibrated: poses may be validated by positions
+        # a part of what was calibrated: positions can validate poses
         kind = next((part for part in kind.parts if stems >= set(part.columns)), kind)
     board = board_of(result.problem.sample().data)
     if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
@@ -209,9 +209,9 @@ def _perhaps_radians(result: Calibration, understanding: Interpretation, q: Arra
 def _understood(
     result: Calibration, source: Any, kind: Measurement, stated: TableOptions, arm: RobotSetup, targets: bool = False
 ) -> Interpretation:
-    """Return the content of tables, read as the calibration's own were; where that does not fit, by their headers.
+    """Return the content of tables, read with the options of the calibration's own, or by headers if these do not fit.
 
-    They are measurements, or targets of the tool of an ``arm``.
+    The tables are measurements, or targets of the tool of an ``arm``.
     """
     sources = source if isinstance(source, list | tuple) else [source]
     reading = dict(result.record.reading)
@@ -221,8 +221,8 @@ def _understood(
     try:
         return interpret_tables(replace(arm, names=options.joints), sources, kind, options, targets)
     except InputError as error:
-        if error.where == "rx, ry, rz":  # which no other reading of the table answers
+        if error.where == "rx, ry, rz":  # another interpretation of the table does not help
             raise
-        with suppress(InputError):  # one that has our names already
+        with suppress(InputError):  # a table with canonical names
             return interpret_tables(arm, sources, kind, stated, targets)
         raise

@@ -50,25 +50,25 @@ from rpim_opt.robot.parameters import (
 from rpim_opt.store.result_file import content
 from rpim_opt.use.sessions import base_frame, registered_again
 
-FALSE_ALARM = 0.01  # probability that a robot that did not change, or does not drift, is said to, over all causes
-MULTIPLES = (1.0, 3.0, 10.0, 30.0)  # multiples of a deviation's prior width that a change may have, each as likely
-UNCHANGED = 0.5  # prior probability that nothing changed; the other half is dealt out to the kinds of causes in use
-OUTLIER_WIDTH = 10.0  # standard deviations by which an outlier is off, times `MULTIPLES`
-UNOBSERVABLE = 1e-9  # part of the largest eigenvalue below which readings do not observe a direction of a change
+FALSE_ALARM = 0.01  # false-alarm probability over all causes for a robot that did not change or drift
+MULTIPLES = (1.0, 3.0, 10.0, 30.0)  # of a deviation's prior width: possible sizes of a change, equally likely
+UNCHANGED = 0.5  # prior probability of no change; the other half is divided among the kinds of causes in use
+OUTLIER_WIDTH = 10.0  # standard deviations of an outlier, times `MULTIPLES`
+UNOBSERVABLE = 1e-9  # relative eigenvalue below which readings do not observe a direction of a change
 STAYING = 1e-2
-"""Scales by which an update changes combinations of parameters that no configuration shows, and the part of one that
-must be left beside released parameters for it to stay."""
-MOST = 4  # changes of robot and frames that are looked for one after the other: of more it is another robot
-FEW = 2  # of which more may be one of a link
-SPARED = 0.25  # part of the readings that may be wrong
-STRANGE = 5.0  # times the error before any calibration by which readings that no change explains are another robot's
-RIVAL, AS_GOOD = 0.05, 4.0  # probability, or what chi-squared falls less by, up to which another cause is named, too
-SHOWN = 5  # causes that are shown
+"""Change by an update, in scales, of combinations of parameters that no configuration shows, and the least part of one,
+beside released parameters, that is kept constant."""
+MOST = 4  # most successive changes of robot and frames: with more it is another robot
+FEW = 2  # more changes than this may be one of a link
+SPARED = 0.25  # largest share of wrong readings
+STRANGE = 5.0  # error over that before any calibration, above which unexplained readings are of another robot
+RIVAL, AS_GOOD = 0.05, 4.0  # of a further cause to be named: probability, or chi-squared above the best
+SHOWN = 5  # number of causes shown
 BASE, PLACE = "base_", 0.1
-"""Scale of a session's offset [m, rad] from which on it says nothing of where: then a new session is registered."""
-OF_ROBOT = ("robot_serial", "controller")  # details of a record that stay when the robot is measured again
-OF_EARLIER = " (of the earlier calibration)"  # of who measured, with what and when, where the new rows do not say it
-UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "  # What title and source of an updated calibration say.
+"""Scale of a session's offset [m, rad] above which its place is unknown: then a new session is registered."""
+OF_ROBOT = ("robot_serial", "controller")  # details of a record that are kept when the robot is measured again
+OF_EARLIER = " (of the earlier calibration)"  # after details of the earlier record that new ones do not replace
+UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "  # in title and source of an updated calibration
 
 
 class Cause(NamedTuple):
@@ -77,8 +77,8 @@ class Cause(NamedTuple):
     name: str
     kind: str  # joint offset or offsets, parameter, link, frame, transmission error, reading
     members: tuple[str, ...]  # parameters, or rows
-    gain: float = 0.0  # by which chi-squared falls
-    p_value: float = 1.0  # of that where nothing changed
+    gain: float = 0.0  # decrease of chi-squared
+    p_value: float = 1.0  # of that decrease without a change
     probability: float = 0.0  # posterior
 
     def __str__(self) -> str:
@@ -87,7 +87,7 @@ class Cause(NamedTuple):
 
 
 Weighed = tuple[tuple[Cause, ...], Fit]
-"""All causes with their evidence, the most probable first, and how well all fits."""
+"""All causes with their evidence, the most probable first, and the fit of all equations."""
 
 
 class Moved(NamedTuple):
@@ -112,14 +112,14 @@ class Moved(NamedTuple):
 class Update:
     """A recalibration with the previous result as prior.
 
-    ``result`` is the calibration, whose record has the previous one; ``before`` and ``after`` are how the ``readings``
-    (their number) fit that, and with the changes. ``changes`` are parameters and frames that changed, and wrong
-    readings, which were left out, in the order of their discovery; ``causes`` all that may have changed, with its
-    evidence before anything was released, the most probable first; ``moved`` by how much the released parameters did.
-    ``errors`` [mm] are those of both calibrations on the readings that were not left out, and on rows held out of the
-    previous one, where nothing was released. ``registered`` is whether the instrument or the base moved so far that the
-    base was registered again; else empty. ``undetermined`` are the frames that were released, or are new, and that the
-    new rows determine worse than their prior does, and changes below twice their standard deviation.
+    ``result`` is the calibration, whose record has the previous one; ``before`` and ``after`` are the fits of the
+    ``readings`` (their number) to the previous one, without and with changes. ``changes`` are changed parameters and
+    frames and wrong readings, which were left out, in the order of discovery; ``causes`` are all possible changes with
+    their evidence before any release, the most probable first; ``moved`` are the movements of released parameters.
+    ``errors`` [mm] are those of both calibrations on the readings used, and on held-out rows of the previous one if
+    nothing was released. ``registered`` states that instrument or base moved so far that the base was registered again;
+    otherwise empty. ``undetermined`` are released or new frames that the new rows determine worse than their prior, and
+    changes below twice their standard deviation.
     """
 
     result: Calibration
@@ -171,7 +171,7 @@ class Update:
 
     def _alternatives(self) -> str:
         """Return a sentence on other changes that the readings do not distinguish from those found; empty if none."""
-        # a frame that moved explains as much as the link before or behind it (base_z as d1), with more parameters
+        # a moved frame explains as much as the adjacent link (base_z as d1), with more parameters
         found = [cause.gain - AS_GOOD for cause in self.changes[:1] if self.changed]
         rivals = [c for c in self.causes[1:] if c.probability > RIVAL or any(c.gain > least for least in found)]
         rivals = [c for c in rivals if not any({*c.members} > {*cause.members} for cause in self.changes[:1])]
@@ -227,17 +227,16 @@ def update(
 ) -> Update:
     """Recalibrate a robot: the posterior of its previous calibration is the prior of this one.
 
-    First the robot is tested for changes. While a change of one parameter, of one frame, or one wrong
-    reading lets chi-squared fall by more than chance would in one robot of a hundred (over all that may have changed),
-    the most probable change is released: its parameters get a prior about where they were, wider than any crash, and
-    all others keep the posterior.
+    First the robot is tested for changes. While the change of one parameter or frame, or one wrong reading, decreases
+    chi-squared by more than chance does in one robot of a hundred (over all possible changes), the most probable change
+    is released: its parameters get a wide prior, beyond any crash, about their previous values; all others keep the
+    posterior.
 
     The result has a squared penalty or none. ``data`` are new measurements of the same robot, in the same instrument's
-    frame unless ``reset`` names them: patterns of parameters that the earlier result does not describe,
-    ``("base_*",)`` where the instrument moved, which is done by itself where it moved far. ``prior_inflation`` is a
-    factor on the earlier standard deviations, where everything may have drifted a little; ``source`` says where the
-    data come from; ``progress`` is called with each step in words. InputError for a result without covariance (lasso),
-    data in blocks, and readings that cannot be this robot's.
+    frame unless ``reset`` has patterns of parameters that the earlier result no longer describes, ``("base_*",)`` for a
+    moved instrument (automatic if it moved far). ``prior_inflation`` is a factor on the earlier standard deviations, in
+    case everything drifted a little; ``source`` names the origin of the data; ``progress`` is called with every step in
+    words. InputError for a result without covariance (lasso), data in blocks, and readings that cannot be this robot's.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -260,10 +259,10 @@ def update(
     elsewhere = not (released or unplaced) and _base_elsewhere(result, problem, base, prior_inflation)
     released += base * elsewhere
     released += tuple(name for name in unplaced if name not in released)
-    anywhere = bool(base) and {*base} <= {*released}  # a base that was reset is registered again
+    anywhere = bool(base) and {*base} <= {*released}  # a reset base is registered again
     start = None if anywhere else previous_deviations(result, problem)
     found = _in_turn(result, problem, released, prior_inflation, start, say, False)
-    if len(found[3]) > FEW or not found[-1].likely:  # many changes of single parameters and readings may be one link
+    if len(found[3]) > FEW or not found[-1].likely:  # many changes of parameters and readings may be one of a link
         of_link = _in_turn(result, problem, released, prior_inflation, start, say, True)
         if of_link[-1].likely and (len(of_link[3]) < len(found[3]) or not found[-1].likely):
             found = of_link
@@ -282,7 +281,7 @@ def update(
         prior_inflation, tuple(name for name in released if name not in unplaced), left_out,
         tuple(_unresolved(vague, bool(reset), after)),
     )  # fmt: skip
-    held_out = None if {*released} - {*unplaced} else result.record.validation  # which was measured before a change
+    held_out = None if {*released} - {*unplaced} else result.record.validation  # measured before a change
     figures, said = _errors(result, updated, held_out)
     registered = " ".join(filter(None, [_bases(result, updated, data) if anywhere else "", said]))
     updated = replace(updated, record=_carried_on(result.record, last, source))
@@ -315,8 +314,8 @@ def _in_turn(
 ) -> tuple[Weighed, Calibration, tuple[str, ...], tuple[Cause, ...], Fit]:
     """Release the most probable change, one after the other, until chance explains the rest.
 
-    Return all causes and the fit before anything is released, the last calibration, what is released there, the changes
-    in the order of their discovery, and the fit after them.
+    Return all causes and the fit before any release, the last calibration, its released parameters, the changes in the
+    order of discovery, and the fit after them.
     """
     changes: list[Cause] = []
     most = {"reading": max(SPARED * len(np.unique(problem.data.configuration)), 1), "link": 1}
@@ -325,14 +324,14 @@ def _in_turn(
         updated = _recalibrated(result, problem, released, inflation, start)
         causes, after = _weighed(result, updated.problem, updated.x, updated.formulation, released, bent)
         first = first or (causes, after)
-        # the most probable of the causes that chance does not explain
+        # the most probable cause that chance does not explain
         cause = next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)
         alike = [each for each in changes if cause and (each.kind == "reading") == (cause.kind == "reading")]
         if cause is None or len(alike) >= most.get(cause.kind, MOST):
             return first, updated, released, tuple(changes), after
         say(f"releasing {cause.name}")
         changes.append(cause)
-        problem = problem.with_parameters(updated.problem.parameters)  # of a base where it was registered
+        problem = problem.with_parameters(updated.problem.parameters)  # with the base if it was registered
         if cause.kind == "reading":
             problem = problem.without(set(cause.members))
         else:
@@ -380,7 +379,7 @@ def _errors(
 
 def _carried_on(record: Record, last: Earlier, source: str) -> Record:
     """Return the record of an updated calibration: of the earlier one what holds for the new measurements, too."""
-    first_source = record.source.rpartition(BEFORE)[2]  # what is said of a file belongs to its own measurements
+    first_source = record.source.rpartition(BEFORE)[2]  # notes on a file belong to its own measurements
     return Record(
         title=f"{record.title.removesuffix(UPDATED)}{UPDATED}",
         source=BEFORE.join(filter(None, [source, first_source])),
@@ -419,7 +418,7 @@ def _unplaced(result: Calibration, problem: CalibrationProblem) -> tuple[str, ..
 
 def _base_elsewhere(result: Calibration, problem: CalibrationProblem, base: tuple[str, ...], inflation: float) -> bool:
     """Return whether readings are displaced together and put the ``base``, by its parameters, out of its place."""
-    # evidence is linear in the deviations: of a base that turned far, it is none
+    # evidence is linear in the deviations: invalid for a large rotation of the base
     data = problem.data
     if not base or not displacement(result, data, held_out_errors(result, data))[0]:
         return False
@@ -445,9 +444,9 @@ def _bases(result: Calibration, updated: Calibration, data: Dataset) -> str:
 def _with_scales_of_motion(
     result: Calibration, updated: Calibration, released: tuple[str, ...], inflation: float
 ) -> Calibration:
-    """Return the update with frames that were released as far from nominal as their scales say, or nearer.
+    """Return the update with released frames within their scales of nominal, by moving the nominal values.
 
-    A base that was reset is far beyond its scale, which later tests would take for a deviation of the robot.
+    A reset base is far beyond its scale, which later tests would take for a deviation of the robot.
     """
     p = updated.problem.parameters
     distance = p.scale.copy()
@@ -461,10 +460,10 @@ def _with_scales_of_motion(
 
 
 def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
-    """Return the sentences of `displacement`, or the change of the robot that leaves clearly less of chi-squared.
+    """Return the sentences of `displacement`, or the change of the robot that leaves clearly less chi-squared.
 
-    That is less by `AS_GOOD`, of new measurements and prior together, than after registration and with another base.
-    What changed between them comes first, unless one change before all leaves no more than the noise.
+    That is less by `AS_GOOD`, of new measurements and prior together, than after registration and with another base. A
+    change between the measurements has priority, unless one before all of them leaves no more than the noise.
     """
     between = _between_rows(result, data)
     moved = displacement(result, data, held)
@@ -498,7 +497,7 @@ def _between_rows(result: Calibration, data: Dataset) -> str:
     """Say what changed, or is otherwise, from some measurements to others, as of a calibration's; empty elsewhere."""
     if not result.problem.keeps_rows or len(result.problem.arms) > 1:
         return ""
-    with suppress(InputError):  # what all rows share is no change; few positions, or on a line, register nothing
+    with suppress(InputError):  # a common motion is no change; few or collinear positions determine none
         data = registered(result, data)[0]
     held = held_out_errors(result, data)
     if np.count_nonzero(held.sigmas > held.allowed) < FEWEST:  # outliers
@@ -519,16 +518,16 @@ def _changes(result: Calibration, data: Dataset) -> Weighed:
 def _moved(
     result: Calibration, updated: Calibration, released: Sequence[str], changes: Sequence[Cause]
 ) -> tuple[Moved, ...]:
-    """Return by how much released parameters moved, but coefficients of curves; of those that were reset, from both.
+    """Return the movements of released parameters, except curves' coefficients; those of reset ones from both results.
 
-    Of those that changed, what neither result knows of them is in both, and no change.
+    For changed parameters the uncertainty common to both results does not count.
     """
     free = updated.problem.parameters.free
     curves = np.array(free.names)[free.of_curves].tolist()
     members = [name for cause in changes if cause.kind != "reading" for name in cause.members]
     changed = [name for name in members if name not in curves]
     reset = [name for name in released if name not in changed]
-    # deviations of a frame registered again refer to another orientation: values do not
+    # deviations of a registered frame refer to another orientation, values do not
     was, now = (each.problem.parameters.by_name(each.x) for each in (result, updated))
     moved: list[Moved] = []
     for name in [name for name in reset if name in result.problem.parameters.free.names and name not in curves]:
@@ -560,9 +559,9 @@ def penalty_of(formulation: Formulation, n: int) -> Quadratic:
 
 
 def by_visit(data: Dataset, visit: np.ndarray | None = None) -> Dataset:
-    """Return checks with one configuration per visit (N,): returning to a place is another configuration.
+    """Return checks with one configuration number per visit (N,): a return to a place is another configuration.
 
-    Without ``visit`` these are runs of equal configurations.
+    Without ``visit``, runs of equal configurations are visits.
     """
     if visit is None:
         visit = np.cumsum(np.diff(data.configuration, prepend=data.configuration[0]) != 0)
@@ -600,13 +599,13 @@ def posterior_as_prior(
         if name in released or name not in known:
             unit, si = display(free.dimensions[i])
             centre[f"{name}_{unit}"] = float(x[i]) / si
-            # so wide that readings alone decide; of a new session no narrower than was stated: few showed their scatter
+            # so wide that readings decide; of a new session at least as stated: few showed their scatter
             width = MULTIPLES[-1] * widths[i] if name in released else max(widths[i], free.scale[i])
             scale[f"{name}_{unit}"] = float(width) / si
     prior = Prior(centre=centre, scale=scale)
     if len(released) < len(free):
         without = tuple(name for name in released if name in known)
-        # in units of the declared noise, as the new readings are: weight 1 then joins both
+        # in units of the declared noise, like the new readings: weight 1 then combines both
         prior = Prior.from_result(result, inflation, without, noise=1.0) & prior
     rows = _staying(result, problem, x, released)
     if len(rows):
@@ -617,11 +616,11 @@ def posterior_as_prior(
 
 
 def _staying(result: Calibration, problem: Source, x: Array, released: Sequence[str]) -> Array:
-    """Return combinations (k, n) [1 / SI] of deviations at x (n,) [SI] that no configuration shows, and that stay.
+    """Return combinations (k, n) [1 / SI] of deviations at x (n,) [SI] that no configuration shows, to be kept.
 
-    A turn of the base and one of joint 1 are such: the posterior is as wide as the prior there, with constant slopes,
-    and in the curvature of what follows (a turn by g moves points by g^2) new readings would fit their noise. Of
-    released parameters, and new ones of a session, all others are held, so that these take the change.
+    A rotation of the base and one of joint 1 form one: its posterior is as wide as the prior, and through curvature (a
+    rotation by g moves points by g^2) new readings would fit their noise with it. Parameters except released ones and
+    those of a new session are fixed, so that these take the change.
     """
     if not isinstance(problem, CalibrationProblem):
         return np.zeros((0, len(x)))
@@ -632,7 +631,7 @@ def _staying(result: Calibration, problem: Source, x: Array, released: Sequence[
         blocks = tuple(replace(block, q=block.q + rng.uniform(-1, 1, block.q.shape)) for block in data.blocks)
         other = problem.on(replace(data, blocks=blocks))
         A = other.contrasts(other.jacobian(x)) * free.scale
-        size = np.linalg.norm(A, axis=1, keepdims=True)  # of pixels of a point beside the camera beyond all others
+        size = np.linalg.norm(A, axis=1, keepdims=True)  # in pixels, a point beside the camera dominates
         slopes.append((A / np.maximum(size, TINY))[np.isfinite(size[:, 0])])
     s, V = np.linalg.svd(np.vstack(slopes), full_matrices=False)[1:]
     kept = np.isin(free.names, result.problem.parameters.free.names) & ~np.isin(free.names, list(released))
@@ -653,7 +652,7 @@ def prior_widths(result: Calibration, problem: Source) -> Array:
     if result.learned is None:
         return default_widths(free)
     stated = dict(zip(result.problem.parameters.free.names, result.learned.stated, strict=True))
-    stated |= {name.rpartition("_")[2]: own for name, own in stated.items() if of_session(name)}  # of new ones, too
+    stated |= {name.rpartition("_")[2]: own for name, own in stated.items() if of_session(name)}  # also of new sessions
     keys = [name.rpartition("_")[2] if of_session(name) and name not in stated else name for name in free.names]
     scale = [stated.get(key, own) for key, own in zip(keys, free.scale, strict=True)]
     return default_widths(replace(free, scale=np.array(scale)))
@@ -674,7 +673,7 @@ def _recalibrated(
             notes=(),
             stated=np.append(learned.stated, more),
             local=np.append(learned.local, np.ones(len(more))),
-            drift=np.zeros((len(updated.x), 0)),  # the prior holds what was not known of the scales
+            drift=np.zeros((len(updated.x), 0)),  # the prior contains the uncertainty of the scales
         )
         rows = _staying(result, problem, previous_deviations(result, problem), released)
         learned = replace(learned, drift=_opened(replace(updated, learned=learned).covariance, rows))
@@ -688,8 +687,8 @@ class Misfit:
     """Deviations of new readings from their predictions, in standard deviations.
 
     With the readings' equations A z ~ b and the prior's L z ~ c, all in standard deviations, a change d of some
-    deviations moves the prior alone, L (z - d) ~ c. By the residual e of both together and M = I - B (B'B)^-1 B' of
-    B = [A; L], with D = [0; L] of the parameters that change::
+    deviations shifts only the prior, L (z - d) ~ c. With the residual e of both together, M = I - B (B'B)^-1 B', B =
+    [A; L], and D = [0; L] restricted to the changed parameters::
 
         chi^2 = e' e        it falls by  g' G^-1 g,    g = D' e,    G = D' M D
     """
@@ -706,7 +705,7 @@ class Misfit:
         self.Q = U[:, s > RANK_TOLERANCE * s[0]]
         self.e = y - self.Q @ (self.Q.T @ y)
         squares = float(self.e @ self.e)
-        # as many degrees of freedom as there are readings, less those that parameters without a prior take
+        # degrees of freedom: readings minus parameters without a prior
         taken = int(np.linalg.matrix_rank(self.A[:, list(reset)])) if len(reset) else 0
         freedom = max(self.m - taken, 1)
         self.fit = Fit.of(squares, freedom, self.noise_dof)
@@ -731,16 +730,16 @@ class Misfit:
 def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -> list[Cause]:
     """Return the candidate changes: parameters, whole frames and whole transmission errors that were not reset.
 
-    A motor that moves several joints shifts all their zeros, and a plate all measured reflectors. With ``bent`` two
-    joint zeros at once are candidates, and links: all six numbers between two joints, which explain most of what moves
-    a frame.
+    A motor that moves several joints shifts all their zeros, and a plate all measured reflectors. With ``bent``, pairs
+    of joint zeros and links are candidates, too: all six numbers between two joints, which explain most motions of a
+    frame.
     """
     free, data = problem.parameters.free, problem.sample().data
     place, measured = registration(free, data), {tool_prefix(m) for block in data.blocks for m in block.markers}
     causes = []
     wholes: dict[tuple[str, str], list[str]] = {}
     for name, frame, curve in zip(free.names, free.of_frames, free.of_curves, strict=True):
-        if name in reset or (of_session(name) and not name.startswith(place)):  # an earlier session is over
+        if name in reset or (of_session(name) and not name.startswith(place)):  # an earlier session has ended
             continue
         kinds = {"frame": frame, "transmission error": curve, "joint offset": is_joint_offset(name), "parameter": True}
         kind = next(kind for kind, holds in kinds.items() if holds)
@@ -766,7 +765,7 @@ def _of_arms(problem: Source, bent: bool) -> Iterator[Cause]:
             if len(moved) > 1:
                 yield Cause(f"motor {arm.joint(motor)} ({joined(moved)})", "joint offset", tuple(moved))
         free = [name for name in (problem.parameters.called(which, zero) for zero in zeros) if name in names]
-        for pair in [*combinations(free, 2)] * bent:  # of several motors that were exchanged, two
+        for pair in [*combinations(free, 2)] * bent:  # two motors that were exchanged
             yield Cause(joined(pair), "joint offsets", pair)
         for i in range(1, len(arm.mdh) * bent):
             own = [f"theta{i}", f"d{i}", f"beta{i}", *(f"{kind}{i + 1}" for kind in ("alpha", "a", "theta", "d"))]
@@ -793,7 +792,7 @@ def _weighed(
     model = problem.linearize(x)
     misfit = Misfit(result, model, penalty_of(prior, len(x)), [free.names.index(name) for name in released])
     width = prior_widths(result, problem) / free.scale
-    tried: list[tuple[Cause, tuple[Array, Array], Array]] = []  # with its change, and the widths of that
+    tried: list[tuple[Cause, tuple[Array, Array], Array]] = []  # with its change, and the change's widths
     for cause in candidates(problem, released, bent):
         index = [free.names.index(name) for name in cause.members]
         tried.append((cause, misfit.projected(slice(misfit.m, None), misfit.L[:, index]), width[index]))
@@ -816,7 +815,7 @@ def log_priors(causes: Sequence[Cause]) -> Array:
 
 
 def log_bayes_factor(g: Array, G: Array, width: Array) -> float:
-    """Return ln of the Bayes factor for a change against none, of widths (p,) times each of `MULTIPLES`.
+    """Return ln of the Bayes factor of a change, with standard deviations (p,) times each of `MULTIPLES`, against none.
 
     ::
 

@@ -17,15 +17,15 @@ from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_session, session_prefix
 
-FEW, SOME = 6, 100  # sessions that are listed, the first ones; measured configurations that stand for all, at most
+FEW, SOME = 6, 100  # sessions that are listed at most; configurations that represent all at most
 
 
 def in_session(result: Calibration, robot: str = "") -> Calibration:
     """Return the calibration with positions, and their U, in the frame of a session instead of the sessions' mean.
 
-    The instrument never stood at the mean of its places: what is uncertain about it is their scatter, and none of the
-    robot's. The session is the one in whose frame the measured configurations are known best; the result itself where
-    it identifies no session.
+    The instrument never stood at the mean of its places: the uncertainty of that frame is their scatter, and none of
+    the robot's. The chosen session is the one in whose frame the measured configurations are known best; the result
+    itself is returned if it identifies no session.
 
     >>> import rpim_opt as ro
     >>> result = ro.load("position").calibrate()
@@ -50,13 +50,13 @@ def set_ups(result: Calibration, data: Dataset) -> list[str]:
 
 
 def registered_again(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
-    """Return measurements, those of `set_ups` after motions into the frame of `in_session`, and the motions in words.
+    """Return measurements, with `set_ups` moved into the frame of `in_session`, and the motions in words.
 
     Each session has the motion that fits its rows best. InputError as of `registered`, with the session's name.
     """
     session, places = in_session(result).problem.session, data.session
     names = set_ups(result, data)
-    if session:  # as rows of another one their intervals would contain the scatter of the instrument's places
+    if session:  # as another session's, their intervals would include the scatter of the instrument's places
         new = np.where(np.isin(places, names), session, places)
         data = replace(data, blocks=tuple(replace(each, session=new[each.row]) for each in data.blocks))
     motions = []

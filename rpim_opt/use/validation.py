@@ -26,13 +26,13 @@ from rpim_opt.use.sessions import registered_again
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Validation(HeldOut):
-    """Errors of a calibration on N new measurements, with the fields of `HeldOut`, and what else they show.
+    """Errors of a calibration on N new measurements, with the fields of `HeldOut` and further findings.
 
-    ``data`` are the measurements, ``vectors`` (N, 3) measured minus predicted position [m], NaN where no position was
-    measured. ``outside`` are rows beyond the joint ranges that the calibration measured, ``touched`` is how far
-    touches are from their points and planes, the worst first [mm], ``remarks`` what a reader of the errors has to know,
-    ``mistake`` names another reading of the measurements that fits far better, if there is one, and ``no_intervals``
-    states why there are none.
+    ``data`` are the measurements, ``vectors`` (N, 3) measured minus predicted position [m], NaN without a measured
+    position. ``outside`` are rows beyond the measured joint ranges of the calibration, ``touched`` are distances of
+    touches from their points and planes [mm], the worst first, ``remarks`` are notes on the errors, ``mistake`` states
+    another interpretation of the measurements that fits far better, if any, and ``no_intervals`` why there are no
+    intervals.
     """
 
     data: Dataset
@@ -136,8 +136,8 @@ class Validation(HeldOut):
 def validate(result: Calibration, data: Dataset, register: bool = False) -> Validation:
     """Return the errors of a calibration on new measurements, compared with its predicted uncertainty.
 
-    ``data`` are by reflectors of the calibration, which may be one of `load_result`, and in the same instrument's frame
-    or, if they ``register``, in any: then the motion that fits them best is applied before they are judged.
+    ``data`` are measured with reflectors of the calibration (which may come from `load_result`), in the same
+    instrument's frame, or with ``register`` in any frame: then the motion that fits them best is applied first.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
