@@ -17,7 +17,7 @@ Options = ParamSpec("Options")
 LONGEST = 1000  # characters of a part of a sentence
 MANY = 32  # names that are listed one by one
 LONGEST_COMPARED = 200
-"""Characters of what is found: names are shorter, and comparing takes as long as both of them together."""
+"""Longest text that is compared with names: these are shorter, and comparison takes time in proportion."""
 
 OPTION = re.compile(r"(rpim-opt [^,;()]*)|(?<![\w-])--([a-z][a-z-]*)")
 """A command with its options, which stays as it is, or an option."""
@@ -30,10 +30,10 @@ class RpimError(Exception):
 class InputError(RpimError):
     """Invalid input: an argument, a file, a key, a column or a row.
 
-    Reads as one sentence, ``file, where: found ..., accepted: ...``; the parts stay available as attributes. ``where``
-    is the key, column, row or argument, ``found`` and ``accepted`` what stands there and what could, ``file`` the file
-    that it stands in, None where there is none. Options of the command line, ``--tip-measured``, are named as arguments
-    of a script, ``tip_measured``, but in the attribute ``command``, which the command line prints.
+    Reads as one sentence, ``file, where: found ..., accepted: ...``; the parts are available as attributes. ``where``
+    is the key, column, row or argument, ``found`` its content, ``accepted`` a valid one, ``file`` the file that has it,
+    None without one. Options of the command line, ``--tip-measured``, are named like arguments of a script,
+    ``tip_measured``, except in the attribute ``command``, which the command line prints.
 
     >>> import rpim_opt as ro
     >>> error = ro.InputError("key joint 2.d_mm", "'long'", "a finite number")
@@ -115,9 +115,9 @@ class Conflict(NamedTuple):
 class NoSolutionFound(RpimError):
     """A convex program has no solution, or the solver found none.
 
-    ``formulation`` is the name of the formulation and ``weight`` the regularization weight, ``status`` that of the
-    solver, such as ``"infeasible"``; ``conflict`` are the contradicting constraints, None if unknown, and ``advice`` is
-    a remedy, if there is no contradiction.
+    ``formulation`` is the name of the formulation, ``weight`` the regularization weight, ``status`` the solver's, such
+    as ``"infeasible"``; ``conflict`` are the contradicting constraints, None if unknown, and ``advice`` is a remedy
+    without them.
 
     >>> import rpim_opt as ro
     >>> problem = ro.load("paper_arm").problem

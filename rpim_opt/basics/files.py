@@ -19,13 +19,13 @@ from typing import Any
 from rpim_opt.basics.exceptions import InputError, choices
 
 LARGEST_TEXT = 2**24
-"""Bytes that a description may have: a hundred times what the largest public ones need."""
+"""Largest description in bytes: a hundred times the largest public ones."""
 LARGEST_DATA = 2**30  # bytes that a table or a result may have: some million rows
 _DEEP = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++\s*+\.\s*+){100}")
 """Dotted keys, which are read in a time that grows with the square of their length."""
 _HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
 """Escapes that JSON reads one by one, whether or not two of them make a character."""
-ENDING = ".part"  # of folders in which files are written
+ENDING = ".part"  # of folders in which files are prepared
 
 
 def require_file(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> None:
@@ -144,8 +144,8 @@ def write_text(path: Path, text: str) -> None:
 def write_files(contents: Mapping[Path, bytes]) -> None:
     """Write several files, once the bytes of all are on the disk: all of them, or none.
 
-    A file keeps its mode, a new one has that of the umask; a link stays one, and what it leads to is written. A device
-    or pipe gets the bytes as they are.
+    A file keeps its mode, a new one has that of the umask; a link stays, and its target is written. A device or pipe
+    gets the bytes directly.
     """
     streams = [path for path in contents if path.exists() and not (path.is_file() or path.is_dir())]
     with writing(*contents), ExitStack() as stack, ExitStack() as renames:

@@ -25,11 +25,11 @@ from rpim_opt.basics.tables import (
 )
 from rpim_opt.basics.units import DIMENSIONS, UNIT_SIGNS, UNITS, numeral, parse_units, split
 
-FULL = 0.6  # a row belongs to the data if it has this part of the numbers of the fullest row
-MOSTLY = 0.8  # a column is one of numbers if this part of its cells are
+FULL = 0.6  # a data row has at least this part of the numbers of the fullest row
+MOSTLY = 0.8  # a column of numbers has at least this part of numeric cells
 LINES_OF_HEADER = 6
 LISTS = ("columns", "constants", "joints")  # options that list names
-MOST_NAMED = 5  # lines that are left out and named one by one
+MOST_NAMED = 5  # skipped lines that are named one by one
 SUMMARIES = frozenset({
     "mean", "average", "avg", "std", "stddev", "stdev", "sigma", "min", "max", "minimum", "maximum", "range", "rms",
     "sum", "total", "median", "standarddeviation", "mittelwert", "mittel", "summe", "stdabw", "standardabweichung",
@@ -41,7 +41,7 @@ COMMENT = re.compile(r"(?:(?://|[#%!*])\s*)+")
 MISSING = re.compile(r"[-\u2013\u2014*?]*|n/?a|nan|none|null|#(?:n/a|value!|ref!|div/0!)|[+-]?1\.#\w+", re.IGNORECASE)
 """Cells that mark a missing value."""
 BLANK_NAME = re.compile(r"[^\s\[(]+(?:\s+\d+(?!\S))?(?:\s*[\[(][^\])]*[\])])?")
-"""A name with its number and unit, in a header whose names and cells are separated by single blanks."""
+"""A name with number and unit, in a header with single blanks between and within names."""
 PART_OF_PI = re.compile(r"([+-]?)\s*(?:(\d+(?:\.\d*)?)\s*\*?\s*)?(?:π|pi)\s*(?:/\s*(\d+))?", re.IGNORECASE)
 """An angle [rad] as a part of pi, ``-pi/2``."""
 GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
@@ -64,22 +64,21 @@ JOINING = ("in", "and", "und", "et", "y", "e")
 
 @dataclass(frozen=True)
 class TableOptions:
-    """Options for reading raw tables; what an empty option would state is detected from the files.
+    """Options for reading raw tables; whatever is left empty is detected from the files.
 
     ``sheet`` is an Excel sheet's name, or its number from 1; ``encoding``, ``separator`` and ``decimal`` are those of a
-    text file: ``"cp1252"``, ``"semicolon"``, ``","``. ``columns`` are the columns' names, instead of a header; one
-    called ``-`` is left out. ``units`` are those of columns whose name carries none, ``"rad,m"``, or by dimension or
-    the columns' stem (`parse_units`).
+    text file: ``"cp1252"``, ``"semicolon"``, ``","``. ``columns`` are column names in place of a header; a column named
+    ``-`` is left out. ``units`` are those of columns whose name has none, ``"rad,m"``, or by dimension or the columns'
+    stem (`parse_units`).
 
-    ``quaternion`` is the order of components that are numbered, ``"wxyz"`` or ``"xyzw"``; empty to check both against
-    the robot. ``rotation`` is what rx, ry, rz are: ``"vector"`` (Universal Robots), or turns about axes that stand
-    still or turn with the body, ``"intrinsic zyx"``; by default roll, pitch, yaw, which is ``"extrinsic xyz"``.
-    ``prefix`` is that of the names of the joints, where columns of several robots are there, ``joints`` what the
-    robot's file calls them; ``constants`` are values of joints that did not move and have no column, by headers with
-    units: ``("torso_lift [m]=0.15",)``.
+    ``quaternion`` is the order of numbered components, ``"wxyz"`` or ``"xyzw"``; empty to check both against the robot.
+    ``rotation`` is the meaning of rx, ry, rz: ``"vector"`` (Universal Robots), or rotations about fixed (extrinsic) or
+    moving (intrinsic) axes, ``"intrinsic zyx"``; by default roll, pitch, yaw, which is ``"extrinsic xyz"``. ``prefix``
+    is that of joint names in a table of several robots, ``joints`` are their names in the robot's file; ``constants``
+    are values of joints that did not move and have no column, by headers with units: ``("torso_lift [m]=0.15",)``.
 
-    ``key`` is the column by which several files are joined, ``"row"`` for the number of the row, and ``within`` the
-    tolerance [s] where they are joined by the nearest time.
+    ``key`` is the column that joins several files, ``"row"`` for the number of the row, and ``within`` the tolerance
+    [s] if they are joined by the nearest time.
 
     >>> import rpim_opt as ro
     >>> options = ro.data.TableOptions(separator="semicolon", units="rad,m", quaternion="xyzw")
@@ -129,10 +128,9 @@ class TableOptions:
 class RawTable:
     """A table as in its file, with numbers in Python's notation.
 
-    ``columns`` are cells by what stands above them, ``Position X [mm]`` (a name that is there again has its place
-    behind it, ``X #7``), ``groups`` what of it groups columns; ``notes`` tell how it was read, and what was left out, a
-    sentence each; ``units`` are those that stand above the header, as `parse_units` has them; ``left`` are the rows
-    below it that are left out.
+    ``columns`` are cells by their header, ``Position X [mm]`` (a repeated name has its position appended, ``X #7``),
+    ``groups`` headers of groups of columns; ``notes`` are sentences on how it was read, and what was left out;
+    ``units`` are those above the header, as returned by `parse_units`; ``left`` are rows below it that are left out.
     """
 
     columns: Columns
@@ -161,7 +159,7 @@ def read_table(
 ) -> RawTable:
     """Return the table of a raw file, or of columns of texts, with one number per cell and one row per point.
 
-    A grid that is ``turned`` has in its rows what others have in their columns.
+    A grid that is ``turned`` has rows and columns exchanged.
     """
     options = options or TableOptions()
     readers = {".parquet": read_columns, ".mat": array_columns, ".npz": array_columns}

@@ -45,10 +45,10 @@ UNITS = {
     for name, si in units.items()
 }
 
-CELSIUS = "temperature_C"  # what everybody calls a temperature in degrees Celsius
+CELSIUS = "temperature_C"  # the common name of a temperature in degrees Celsius
 LARGEST = 1e7
-"""Size of what can be measured or drawn [m, rad, ...]: map coordinates in metres, a million turns. Beyond it a double
-has no digits left for micrometres."""
+"""Largest measured or nominal value [m, rad, ...]: map coordinates in metres, a million turns. Beyond it a double has
+no digits left for micrometres."""
 SMALLEST = 1e-15
 """Standard deviations and scales [SI] that are not zero: below an atom's size, where squares still are numbers."""
 
@@ -57,10 +57,10 @@ DISPLAY = {
     "temperature": "K", "ratio per temperature": "ppm_per_K", "length per temperature": "um_per_K",
     "angle per temperature": "urad_per_K", "length per force": "um_per_N", "pixel": "px",
 }  # fmt: skip
-"""The unit in which a dimension is shown and written."""
+"""Unit in which a dimension is shown and written."""
 
 WITH_UNIT = re.compile(rf"_({'|'.join(sorted(UNITS, key=len, reverse=True))})\Z")
-LONGEST = 200  # characters of a pattern or a name: longer ones would take too long to match
+LONGEST = 200  # longest pattern or name in characters: longer ones take too long to match
 
 
 def accepted_units(dimension: str) -> tuple[str, ...]:
@@ -174,7 +174,7 @@ SPELLED = {
 }  # fmt: skip
 """Units as they are spelled in headers; a small grad may be a gon."""
 UNIT_SIGNS = frozenset(map(str.lower, [*UNITS, *SPELLED, "-", "s", "1"]))
-"""What stands in a line of units, in lower case."""
+"""Contents of a line of units, in lower case."""
 IN_A_NAME = (
     re.compile(r"(.+?)[\s_]*[\[(]\s*(\S+?)\s*[\])]"),
     re.compile(r"(.+?)\s*/\s*(\S+)"),

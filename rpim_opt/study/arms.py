@@ -16,20 +16,20 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import model_parameters
 
 KINDS = {"ur10e": ["beta[23]"], "irb120": ["beta2"], "iiwa7": []}
-"""Ready robots that arms are made of, with Hayati's parameter where neighbouring axes are parallel."""
+"""Ready robots on which arms are based, with Hayati's parameter where neighbouring axes are parallel."""
 SCALES = {"length_mm": 1.0, "angle_mrad": 1.0, "tool_mm": 10.0, "base_mm": 100.0, "base_mrad": 100.0}
-"""What is stated of every arm, as a folder states it that knows nothing."""
+"""Prior scales stated for every arm, those of a folder without further knowledge."""
 BASE = (1.5, -0.8, 0.3, 0.0, 0.0, 0.6)
 TOOL = (0.04, -0.02, 0.11, 0.0, 0.0, 0.0)
 REACH = np.radians(120)
-VALIDATION_COUNT = 200  # configurations that an arm is judged at
+VALIDATION_COUNT = 200  # configurations at which an arm is judged
 
 
 class SimulatedArm(NamedTuple):
     """Simulated tracker measurements of an arm with known true parameters.
 
-    ``problem`` has the identification data and generic scales, ``true`` the positions of validation configurations as
-    they are [m], ``read`` the same as the tracker reads them.
+    ``problem`` has the identification data and generic scales, ``true`` the true positions of validation configurations
+    [m], ``read`` the tracker's readings of the same.
     """
 
     problem: CalibrationProblem
@@ -46,14 +46,14 @@ def simulated_arm(
 ) -> SimulatedArm:
     """Return a simulated arm; successive seeds cycle through three robots.
 
-    Behind every link there is a small transform. Its lengths are normal with a standard deviation of 0.05 to 1 mm
-    (log-uniform, one an arm), its angles with 1 to 30 mrad a mm of that (at most 5 mrad), each times exp(N(0, 1)) of
-    its own; joints are off by three such angles more. The base is known to 2 mm and 2 mrad, the reflector to 3 mm.
+    A small transform follows every link. The standard deviation of its lengths is 0.05 to 1 mm (log-uniform, one per
+    arm), that of its angles 1 to 30 mrad per mm of this (at most 5 mrad), each with an own factor exp(N(0, 1)); joint
+    offsets add three times such angles. The base is known to 2 mm and 2 mrad, the reflector to 3 mm.
 
-    The ``seed`` is that of the arm; ``count``, the number of configurations to identify from, changes neither its truth
-    nor those it shares with a smaller one. ``noise`` is the standard deviation of a coordinate [m], declared as it is,
-    ``offset`` the angle [rad] by which one joint, neither the first nor the last, is off besides. ``joints`` are the
-    robot's joint values at those of the encoders (N, dof) [rad]: what no geometry holds.
+    ``seed`` is that of the arm; ``count``, the number of identification configurations, changes neither its truth nor
+    the configurations in common with a smaller count. ``noise`` is the standard deviation of a coordinate [m], declared
+    correctly, ``offset`` an additional angle [rad] of one joint, neither the first nor the last. ``joints`` returns the
+    robot's joint values at encoder values (N, dof) [rad], for errors beyond geometry.
 
     >>> import rpim_opt as ro
     >>> arm = ro.study.simulated_arm(seed=1, count=25, offset=0.017)
@@ -67,7 +67,7 @@ def simulated_arm(
     length = np.exp(rng.uniform(np.log(5e-5), np.log(1e-3)))
     angle = min(length * np.exp(rng.uniform(0, np.log(30))), 5e-3)
     local = np.exp(rng.standard_normal((robot.dof, 6)))
-    # a small transform a row: lengths [m], rotation vector [rad]
+    # a small transform per row: lengths [m], rotation vector [rad]
     errors = rng.standard_normal((robot.dof, 6)) * local * np.repeat([length, angle], 3)
     errors[:, 5] += 3 * angle * rng.standard_normal(robot.dof)
     errors[rng.integers(1, robot.dof - 1), 5] += offset * rng.choice([-1.0, 1.0])

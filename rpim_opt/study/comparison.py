@@ -24,15 +24,15 @@ from rpim_opt.store.instances import Instance
 from rpim_opt.study import studies
 from rpim_opt.study.methods import METRICS, UNDELIVERED, methods_of, metrics_of, problems_of, replicate, splits_of
 
-USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")  # metrics of a comparison that states none
-COVERED = "covered_percent"  # the metric of which neither less nor more is better, but 95
-MOST_DRAWS = 100_000  # each is a calibration of its own, and is listed before the first begins
-TIE = 0.01  # errors that differ by no more than this part are a tie
-ENOUGH = 5  # problems from which on an interval speaks of problems like them; with fewer, of these
+USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")  # metrics of a comparison unless stated
+COVERED = "covered_percent"  # a metric for which neither less nor more is better, but 95
+MOST_DRAWS = 100_000  # each is a calibration, and is listed before the first begins
+TIE = 0.01  # relative difference of errors that counts as a tie
+ENOUGH = 5  # problems from which an interval refers to similar problems; with fewer, to these
 CONFIDENCE = 0.95
-GROSS = 10.0  # largest held-out error over the mean one, from which on a reading is wrong
+GROSS = 10.0  # largest over mean held-out error that means a wrong reading
 SAME_DATA = ("problem", "split", "fold", "count", "seed")
-"""Columns in which two replicates of a pair agree: then they saw the same data."""
+"""Columns that agree for two replicates of a pair: they used the same data."""
 Pair = tuple[Any, ...]
 Rows = Sequence[Mapping[str, Any]]
 
@@ -55,34 +55,35 @@ def compare(
 ) -> Comparison:
     """Compare formulations, selectors and user-defined methods on problems, by errors on held-out data.
 
-    Every problem with every formulation, selector, split and seed is one replicate; what cannot be (a lasso with REML)
-    and what fails has its reason in it. All methods see the same data, so that errors are compared in pairs.
+    Every problem with every formulation, selector, split and seed is one replicate; impossible ones (a lasso with REML)
+    and failures have a reason. All methods use the same data, so that errors are compared in pairs.
 
     ``problems`` are a folder, a name that comes with the package, ``ro.load(...)``, a problem, a pair of a problem and
     validation data, a folder of problem folders, a function of a seed that returns one of these or a `SimulatedArm`; or
-    several, in a list or by names of your own, ``{"cell 7": "data/cell7"}``. ``formulations`` are ready ones by name,
-    objects, ``"folder"`` for the folder's own; ``selectors`` names, selectors, numbers, ``"learned"``, ``"folder"``. A
-    formulation without penalty is there once, with the selector ``none``. ``methods`` are baselines by name
-    (``"levenberg_marquardt"``; ``"nominal"`` fits frames alone) and functions of the problem that return deviations
+    several, in a list or a mapping with names, ``{"cell 7": "data/cell7"}``. ``formulations`` are names of ready ones,
+    objects, or ``"folder"`` for the folder's own; ``selectors`` are names, selectors, numbers, ``"learned"``, or
+    ``"folder"``. A formulation without penalty appears once, with the selector ``none``. ``methods`` are baselines by
+    name (``"levenberg_marquardt"``; ``"nominal"`` only fits frames) and functions of the problem that return deviations
     (n,) [SI], a calibration, or a function from joint values (N, dof) to positions (N, 3) [m]. ``options`` are further
-    ones of every calibration: ``{"model": "auto"}``.
+    arguments of every calibration: ``{"model": "auto"}``.
 
-    ``splits`` are the configurations held out: ``"folder"``, the validation data of the problem; a part of its
-    data (``0.25``); in how many folds (``5``), one replicate a fold. ``counts`` are of how many of the others to
-    identify from, by default all. ``seeds`` are how many, or which: of generated problems, splits and draws.
+    ``splits`` state the held-out configurations: ``"folder"``, the problem's validation data; a share of its data
+    (``0.25``); or a number of folds (``5``), one replicate each. ``counts`` are numbers of the other configurations
+    used for identification, by default all. ``seeds`` is their number, or a list: of generated problems, splits and
+    draws.
 
-    ``metrics`` are of the rows held out: ``"rms_mm"``, ``"mean_mm"``, ``"p95_mm"``, ``"max_mm"``, ``"rms_mrad"``,
-    ``"fit_rms_mm"`` (of the rows that were fitted), ``"covered_percent"`` (of 95 % intervals), ``"seconds"``; or
-    functions of a `Fitted`, by names that carry their unit. Summaries are of the first one, of which less is better.
+    ``metrics`` of the held-out rows are ``"rms_mm"``, ``"mean_mm"``, ``"p95_mm"``, ``"max_mm"``, ``"rms_mrad"``,
+    ``"fit_rms_mm"`` (of the identification rows), ``"covered_percent"`` (of 95 % intervals), ``"seconds"``; or
+    functions of a `Fitted`, by names with their unit. Summaries use the first one, for which less has to be better.
 
-    ``workers`` are processes on this machine, -1 for all processors; or of a cluster, where ``joblib.parallel_config``
-    names one. Finished replicates are written to the file ``journal``, with which a call with the same code (of the
-    Python files that are loaded) and arguments goes on: more seeds, splits and counts may be added. It refuses other
-    code and arguments, and those that cannot be pickled; what functions read besides, as ``sys.argv``, it does not
-    know. ``resume`` is False to start again; None refuses to drop what it has. ``progress`` is whether a bar is shown,
-    or a function of the finished and the total number.
+    ``workers`` is the number of processes on this machine, -1 for all processors; or of a cluster that
+    ``joblib.parallel_config`` names. Finished replicates are written to the file ``journal``; a call with the same code
+    (of the loaded Python files) and arguments continues it, and may add seeds, splits and counts. Other code and
+    arguments, and those that cannot be pickled, are refused; other inputs of functions, such as ``sys.argv``, are not
+    noticed. ``resume`` False starts again; None refuses to discard results. ``progress`` is whether a bar is shown, or
+    a function of the finished and the total number.
 
-    InputError before anything is computed: for unknown names, words and numbers, and a journal of something else.
+    InputError before any computation, for unknown names and invalid numbers, and for a journal of something else.
 
     >>> import rpim_opt as ro
     >>> found = ro.compare(["position", "seven_axis"], ["tikhonov", "lasso"], ["learned", "reml"])
@@ -108,7 +109,7 @@ def compare(
     if next(iter(figured)) == COVERED:
         raise InputError("metrics", f"'{COVERED}' first, of which 95 is best", "a first metric to minimize")
 
-    def work(case: Mapping[str, Any]) -> studies.Work:  # which takes no more along than it needs
+    def work(case: Mapping[str, Any]) -> studies.Work:  # a closure of only what it needs
         return partial(
             replicate, by_label[case["problem"]], ways[case["split"]], compared[case["method"]], figured, case
         )
@@ -118,7 +119,7 @@ def compare(
     cases: list[studies.Row] = []
     for (label, problem), (split, size), count in product(by_label.items(), ways.items(), numbers_drawn):
         every = np.inf if callable(problem) else len(np.unique(problem.problem.data.configuration))
-        # what a seed changes: what is generated or held out, which configurations are drawn
+        # a seed changes generated problems, held-out rows and drawn configurations
         seeded = callable(problem) or size > 0 or (count is not None and count < every)
         folds = range(1, max(int(size), 1) + 1)
         for seed, fold, (name, method) in product(numbered if seeded else numbered[:1], folds, compared.items()):
@@ -202,10 +203,10 @@ class Comparison:
         return frame_of(self.rows)
 
     def summary(self, metric: str | None = None, against: str | None = None) -> Summary:
-        """Return the methods in their order, each against a reference on the same replicates.
+        """Return the methods in their order, each compared with a reference on the same replicates.
 
-        The metric is a column of which less is better, by default the first; the reference a method's label, by default
-        the first one that has figures. InputError for an unknown metric or method, or where nothing has figures.
+        ``metric`` is a column for which less is better, by default the first; ``against`` is the reference's label, by
+        default the first method with figures. InputError for an unknown metric or method, or if no method has figures.
         """
         metric = metric or self.metric
         ranked = [name for name in self.metrics if name != COVERED]
@@ -287,11 +288,11 @@ class Comparison:
 class Standing:
     """Metrics of a method, and its ratio to the reference on the same replicates.
 
-    Of its ``replicates`` some are ``missing`` (without a figure); ``median`` and ``worst`` are of its figures.
-    ``ratio`` is the geometric mean of its figures over those of the reference, every problem counting the same (None
-    without pairs), ``low`` and ``high`` the ends of its 95 % interval (None where there is too little to say). On
-    ``wins``, ``ties`` and ``losses`` replicates it is better than the reference, as good within 1 %, or worse; one
-    without a figure loses against one with.
+    Of its ``replicates`` some are ``missing`` (without a figure); ``median`` and ``worst`` are those of its figures.
+    ``ratio`` is the geometric mean of its figures over the reference's, with equal weight of every problem (None
+    without pairs), ``low`` and ``high`` are the ends of its 95 % interval (None with too little data). On ``wins``,
+    ``ties`` and ``losses`` replicates it is better than the reference, equal within 1 %, or worse; a replicate without
+    a figure loses against one with.
     """
 
     method: str
@@ -316,8 +317,8 @@ class Standing:
 class Summary:
     """Methods ranked by the geometric mean of their metric.
 
-    Less of the ``metric`` is better; others are compared with the ``reference``. ``standings`` are one a method that
-    has figures; ``notes`` state what the intervals refer to, and what is not delivered or has no results.
+    Less of the ``metric`` is better; methods are compared with the ``reference``. ``standings`` has one entry per
+    method with figures; ``notes`` state what the intervals refer to, and methods not delivered or without results.
     """
 
     metric: str
@@ -374,14 +375,14 @@ def figures(rows: Rows, metric: str) -> dict[str, dict[Pair, float]]:
 def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[float | None, float | None, float | None]:
     """Return the geometric mean of paired ratios, given as logarithms, and the ends of its 95 % interval.
 
-    Replicates of one problem have the problem in common. The mean is over problems, of each one's mean; and with five
-    problems or more Student's interval is by how these scatter, so that it refers to other problems like these. With
-    fewer, by how what is independent within each scatters: the arms of a generator, the seeds or else the folds of a
-    measured one; then it speaks of other such arms, seeds or folds.
+    Replicates of one problem are correlated. The mean is over the problems' means; with five or more problems,
+    Student's interval uses their scatter and refers to similar problems. With fewer, it uses the scatter within each
+    problem of what is independent: arms of a generator, seeds, or folds of a measured problem; it then refers to
+    similar arms, seeds or folds.
     """
     if not ratios:
         return None, None, None
-    groups = []  # of every problem the means of what is independent: seeds, or folds where seeds are few
+    groups = []  # means per problem of independent units: seeds, or folds if seeds are few
     for label in dict.fromkeys(pair[0] for pair in ratios):
         own = {pair: ratio for pair, ratio in ratios.items() if pair[0] == label}
         by_seed = label in drawn or len({pair[-1] for pair in own}) >= ENOUGH
@@ -433,7 +434,7 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
     every = Counter(row["method"] for row in rows)
     without: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:
-        if row["status"] == UNDELIVERED:  # each for reasons with figures of its own
+        if row["status"] == UNDELIVERED:  # each for reasons with different figures
             row = {**row, "reason": "their figures are included; the column `reason` states why."}
         if row["reason"]:
             without.setdefault((row["method"], row["status"], row["reason"]), []).append(row["problem"])
@@ -456,7 +457,7 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     >>> len(figure.axes)
     1
     """
-    from matplotlib.figure import Figure  # which nothing but a figure needs
+    from matplotlib.figure import Figure  # only needed for figures
 
     ax = Figure(figsize=(7, 0.32 * len(values) + 0.9), layout="constrained").add_subplot()
     ax.set_yticks(range(len(values)), list(values), fontsize=8)
@@ -465,7 +466,7 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     ax.grid(axis="x", alpha=0.25)
     for y, known in enumerate(values.values()):
         dots = ax.plot(known, [y] * len(known), "o", ms=3, alpha=min(1.0, 5 / len(known) ** 0.5), color="C0", mew=0)
-        dots[0].set_rasterized(len(known) > 50)  # thousands of dots would make megabytes of SVG
+        dots[0].set_rasterized(len(known) > 50)  # thousands of dots take megabytes of SVG
         middle = sorted(known)[len(known) // 2]
         ax.plot([middle], [y], "|", ms=11, mew=2, color="C3")
         ax.annotate(f"{middle:.3g}", (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=8)

@@ -32,8 +32,8 @@ from rpim_opt.study.studies import Row
 ACCEPTED = "a folder, a name, ro.load(...), a problem, or a function of a seed that returns one"
 RETURNS = "an instance, a simulated arm, a problem, or a pair of a problem and validation data"
 FOLDER = "folder"
-MOST_FOLDS = 10_000  # each is a calibration of its own, and is listed before the first begins
-NONE = "none"  # the selector of what has no weight
+MOST_FOLDS = 10_000  # each is a calibration, and is listed before the first begins
+NONE = "none"  # the selector of methods without weight
 BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
     "nominal": fitted_frames,
     **{name: getattr(baselines, name) for name in baselines.__all__},
@@ -221,8 +221,8 @@ def _weight(label: str, each: Any) -> tuple[str, dict[str, Any]]:
 def errors_by(returned: Any, problem: CalibrationProblem, label: str) -> Callable[[Dataset, str], Array]:
     """Return the errors (N,) of data by dimension [m or rad] that a method's result leaves.
 
-    That is a calibration, a baseline, x (n,), or a function of q (N, dof); instead of x alone it may be a problem that
-    identifies other parameters, and x. InputError for anything else.
+    The result is a calibration, a baseline, x (n,), or a function of q (N, dof); x may come as a pair with the problem
+    whose parameters it refers to. InputError for anything else.
     """
     if isinstance(returned, tuple | list) and len(returned) == 2 and isinstance(returned[0], CalibrationProblem):
         problem, returned = returned
@@ -331,12 +331,12 @@ def replicate(
         row["parameters"] = len(instance.problem.parameters.free)
         if result is not None:
             row["weight"] = float(result.weight)
-            reasons = judge(result).reasons  # without likely mistakes in the data, which all methods share
+            reasons = judge(result).reasons  # without likely mistakes in the data, common to all methods
             if reasons:
                 row |= {"status": UNDELIVERED, "reason": " ".join(reasons)}
         return row | values
     except InputError as error:
         row |= {"status": "impossible", "reason": str(error)}
-    except Exception as error:  # somebody's function, a solver: the other replicates go on
+    except Exception as error:  # by foreign functions or a solver: the other replicates continue
         row |= {"status": "failed", "reason": f"{type(error).__name__}: {error}"}
     return {**row, **dict.fromkeys(metrics)}

@@ -33,19 +33,19 @@ from rpim_opt.store.own_code import run_file
 from rpim_opt.store.problem_file import problems_folder
 
 NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
-"""What a study has; if it has prepare(quick), too, that is called once before the first case."""
+"""Required names of a study; an optional prepare(quick) is called once before the first case."""
 FILE = "study.py"  # the study of a folder
-MOST_FILES = 10_000  # of the files beside a study, each of which is read before its replicates are resumed
+MOST_FILES = 10_000  # largest number of files beside a study, all of which are read before replicates are resumed
 REPLICATES = "replicates"
 PICTURES: dict[str, dict[str, Any]] = {"svg": {"Date": None}, "png": {}}
-"""Formats of figures, and what is written into them besides: without the time the same file for the same figure."""
+"""Formats of figures and their metadata: without the time, equal figures give equal files."""
 
 
 @dataclass(frozen=True)
 class Metric:
     """A metric of a study that must not get worse: its direction, and its relative tolerance.
 
-    ``better`` is ``"lower"`` or ``"higher"``, ``tolerance`` what part of the baseline it may be worse by.
+    ``better`` is ``"lower"`` or ``"higher"``, ``tolerance`` the part of the baseline by which it may be worse.
     """
 
     better: str
@@ -66,7 +66,7 @@ Work = Callable[[], Row]  # computation of a replicate; it travels to wherever i
 PACKAGE = Path(__file__).resolve().parents[1]
 STUDIES = PACKAGE.parent / "studies"  # of the checkout; an installed package has none
 LIBRARIES = [Path(sysconfig.get_path(key)).resolve() for key in ("stdlib", "platstdlib", "purelib", "platlib")]
-"""Where Python files lie that the versions of packages stand for."""
+"""Folders of Python files that are identified by the versions of packages."""
 SHORT = 12  # digits of a digest that a reader compares by eye
 
 
@@ -115,8 +115,8 @@ def load_study(path: Path, needed: tuple[str, ...] = NEEDED) -> ModuleType:
 def files_of(path: Path, study: ModuleType) -> dict[str, str]:
     """Return digests of the files that a study depends on, by their names in its folder.
 
-    That is whatever lies in its folder but hidden files and results of studies. Where the study defines ``DEPENDS =
-    ["data/*.csv"]``, it is that and Python files.
+    These are all files in its folder except hidden files and results of studies; if the study defines ``DEPENDS =
+    ["data/*.csv"]``, those and Python files.
     """
     folder = path.parent
     patterns = getattr(study, "DEPENDS", None)
@@ -155,12 +155,11 @@ def run_study(
 ) -> tuple[Report, Path]:
     """Run a study; return its report and the folder with ``README.md``, ``metrics.json``, replicates and figures.
 
-    Every replicate is a case, a table of plain values with the seed among them, so that results do not depend on who
-    computes them. A finished replicate is written down at once. The ``name`` is a file ``mine.py``, a folder with
-    ``study.py``, or a study of the checkout without its ending; ``quick`` is the small version; ``workers``,
-    ``resume`` and ``progress`` are as `run_cases` has them. ``redraw`` computes nothing: the report is
-    rewritten from the replicates of the last run. Results go to ``out``, by default ``results/NAME`` or
-    ``results/NAME-quick`` beside the study.
+    Every replicate is a case, a table of plain values that includes the seed, so that results do not depend on who
+    computes them. Finished replicates are stored at once. ``name`` is a file ``mine.py``, a folder with ``study.py``,
+    or a study of the checkout without its ending; ``quick`` runs the small version; ``workers``, ``resume`` and
+    ``progress`` are as for `run_cases`. ``redraw`` only rewrites the report from the replicates of the last run.
+    Results go to ``out``, by default ``results/NAME`` or ``results/NAME-quick`` beside the study.
     """
     path = find_study(name)
     study = load_study(path)
@@ -194,7 +193,7 @@ def _replicate(
         study.prepare(quick)
     cases = study.cases(quick)
     files = files_of(path, study)
-    # what makes them is what is here now, whatever becomes of it meanwhile
+    # results belong to the present files, whatever happens to them meanwhile
     name = _label(path) if path.parent == STUDIES else path.name
     source = f"`rpim-opt study {name}{' --quick' * quick}`, {file_state(path)}, with {package_state()}"
     digest = sha256(repr(sorted(files.items())).encode()).hexdigest()[:SHORT]
@@ -268,13 +267,13 @@ def run_cases(
 ) -> list[Row]:
     """Return every case with its figures, in the order of the cases.
 
-    ``cases`` are plain tables, and ``work`` returns what computes one; ``code`` are digests of what replicates follow
-    from. Those of an interrupted run are resumed (true), dropped (false), or refused (None), as those of other code.
+    ``cases`` are plain tables, and ``work`` returns the computation of one; ``code`` has digests of what replicates
+    depend on. Those of an interrupted run are resumed (True), dropped (False), or refused (None), like other code's.
     """
     keyed = [(json.dumps(case, sort_keys=True), case) for case in cases]
     stored = {} if journal is None or resume is False else _resumed(journal, code, resume)
     done = {key: stored[key] for key, _ in keyed if key in stored}
-    if journal is not None:  # anew: without a line that was not finished
+    if journal is not None:  # rewritten, without an unfinished line
         lines = "".join(f"{json.dumps(line)}\n" for line in {"code": code, **stored}.items())
         write_files({journal: lines.encode()})
     with Path(journal or os.devnull).open("ab", buffering=0) as stream:
@@ -293,7 +292,7 @@ def _resumed(path: Path, code: Mapping[str, str], resume: bool | None) -> dict[s
     if not (path.exists() or path.is_symlink()):
         return {}
     content = read_bytes(path, LARGEST_DATA)
-    try:  # of the lines that were finished
+    try:  # of the finished lines
         stored = dict(json.loads(line) for line in content[: content.rfind(b"\n") + 1 or None].splitlines())
         known = dict(stored.pop("code", {}))
     except (TypeError, ValueError):
@@ -320,8 +319,8 @@ def compute(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[tuple[s
         return
     joblib = library("joblib", "workers", "studies")
     answer = None
-    with suppress(ValueError):  # of a thread that is not the main one
-        answer = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as processes inherit: Ctrl-C is this one's to answer
+    with suppress(ValueError):  # raised outside the main thread
+        answer = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited by processes: only this one handles Ctrl-C
     try:
         parallel = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")
         finished = parallel(joblib.delayed(_computed)(*task) for task in tasks)
@@ -418,7 +417,7 @@ def script_code() -> dict[str, str]:
 def content_hash(thing: Any, where: str) -> str:
     """Return the hash of a value or an object by joblib, of what can be pickled.
 
-    Functions count by their names: their code is that of `script_code`. InputError for what cannot be pickled, such as
+    Functions count by name: their code is that of `script_code`. InputError for objects that cannot be pickled, such as
     a lambda or a generator, and for functions of an interactive session, which has no file.
     """
 
@@ -436,6 +435,6 @@ def content_hash(thing: Any, where: str) -> str:
         if hasattr(sys.modules["__main__"], "__file__") or b"__main__" not in whole.getvalue():
             return str(type("Hasher", (hasher,), {"reducer_override": reduced})("sha256").hash(thing))
         found = "a function of an interactive session"
-    except Exception as error:  # of any library's own making
+    except Exception as error:  # any library's own
         found = f"something that cannot be pickled ({error})"
     raise InputError(where, found, "what can be pickled, with functions of a file by their names; or no journal")

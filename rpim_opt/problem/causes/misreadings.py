@@ -38,19 +38,19 @@ from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot, numbered
 
-BETTER = 0.2  # another reading of the data is reported when it leaves less than this part of the position error
-RARE = 1e-6  # probability with which chance may explain what is reported
+BETTER = 0.2  # another interpretation is reported if its position error is below this part of the present one
+RARE = 1e-6  # p-value of reported interpretations
 SIBLING, SIBLING_BETTER = 0.1, 0.5
-"""A ready robot whose nominal parameters differ by less [m, rad] is reported from this part of the error on."""
-FURTHER = 0.7  # a second mistake is looked for behind a reading that leaves less than this part
-WRONG = 0.02  # points that are off by more than this part of their extent fit no nominal model of their robot
-LEFT = 0.05  # what leaves more than this part of the extent explains nothing, even if gross errors are behind it
-FEW = 30  # rows of a first try; what comes near the best is tried on more
-SAME = 1.05  # readings that leave within this factor the same cannot be told apart
+"""Difference of nominal parameters [m, rad] to a similar ready robot; part of the error that it may leave."""
+FURTHER = 0.7  # a further mistake is sought behind an interpretation that leaves less than this part
+WRONG = 0.02  # errors above this part of the points' extent fit no nominal model of their robot
+LEFT = 0.05  # an interpretation with larger errors over the extent explains nothing, even with gross errors
+FEW = 30  # rows of a first trial; promising ones are tried on more
+SAME = 1.05  # ratio of errors up to which interpretations cannot be distinguished
 MISTAKES = {False: 3, True: 1}
-"""Mistakes that are looked for at once; one alone of a camera's views, whose lens is not known yet and blurs others."""
+"""Most combined mistakes; one for a camera's views, whose unknown lens blurs others."""
 COUPLINGS = {True: (1.0, -1.0, 0.5, -0.5), False: (1.0, -1.0)}
-"""How much of another joint a joint may count, of a neighbour and of others."""
+"""Trial coupling factors of a joint to a neighbour, and to others."""
 LENGTHS = {
     1e3: ("a thousand times larger", "name the columns x_m, y_m, z_m, or multiply an array by 1000"),
     1e-3: ("a thousand times smaller", "name the columns x_mm, y_mm, z_mm, or divide an array by 1000"),
@@ -116,7 +116,7 @@ class Better(NamedTuple):
 def pose_misfit(robot: Robot, data: Dataset, tool: Array | None = None) -> float:
     """Return the RMS angle [rad] between measured and nominal orientations of the data's first block of poses.
 
-    Base and tool are fitted; pi where the poses do not determine them. With a ``tool`` (6,) they are in the robot's
+    Base and tool are fitted; pi if the poses do not determine them. With a ``tool`` (6,) the poses are in the robot's
     base.
     """
     block = next(each for each in data.blocks if each.measurement.name == "pose")
@@ -531,9 +531,9 @@ def _other_robots(points: Points) -> Iterator[Misreading]:
 def better_interpretation(problem: CalibrationProblem, whole: bool = True) -> Better | None:
     """Return the interpretation that fits far better than the table as written, or None.
 
-    Single mistakes are tried first, then a second and a third one behind the best of them; where the nominal model
-    cannot be right, all orders of up to six joints, and the ready robots, which no part of a ``whole`` table has for
-    itself. Base or anchor and reflectors are fitted anew for every reading.
+    Single mistakes are tried first, then second and third ones behind the best of them; if the nominal model cannot be
+    right, also all orders of up to six joints, and, unless the table is only a part (not ``whole``), the ready robots.
+    Base or anchor and reflectors are fitted for every interpretation.
     """
     problem = of_sessions(problem)[0]
     points = points_of(problem) or lengths_of(problem)

@@ -31,7 +31,7 @@ from rpim_opt.problem.registration.points import FAR, Fit, Points, agreeing, fit
 from rpim_opt.robot.kinematics import forward_kinematics
 
 FAR_MOVED = 0.005
-"""Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
+"""For points that fit better than this part of their extent, an instrument's motion is sought in residuals only."""
 SINGLE = 1 / 3  # share of the rows up to which single ones have a joint value wrong
 UNLIKELY = 1e-3  # probability with which outliers may agree on one joint by chance
 UNRELATED = 0.25  # part of the spread of positions that a fit leaves where joint values do not explain them
@@ -57,8 +57,8 @@ def single_rows(problem: CalibrationProblem) -> Iterator[str]:
 def computed_columns(problem: CalibrationProblem) -> Iterator[str]:
     """Report coordinates or orientations that are exact functions of the nominal robot: computed, not measured.
 
-    A coordinate of a point in any frame, of any reflector, is linear in position and rotation of the nominal flange. In
-    any frame, of any tool, orientations turn by the same angle from row to row.
+    Coordinates of a point in any frame, for any reflector, are linear in position and rotation of the nominal flange.
+    Orientations in any frame, for any tool, rotate by the same angle from row to row.
     """
     points = points_of(problem)
     if points is None or points.by_camera or len(points.row) < FEWEST:
@@ -156,9 +156,9 @@ def odd_column(problem: CalibrationProblem) -> Iterator[str]:
 
 
 def _odd_values(problem: CalibrationProblem, points: Points) -> Iterator[str]:
-    """Report a joint or coordinate whose values are wrong: with its own value in every row, the others fit.
+    """Report a joint or coordinate with wrong values: if its values are free in every row, the rows fit.
 
-    Base, reflectors and these values are fitted in turn, those of a joint on a grid that gets narrower.
+    Base, reflectors and these values are fitted in turn, joint values on a successively finer grid.
     """
     points = replace(points, turns=None)
     whole = misfit(points)
@@ -195,7 +195,7 @@ def _unsigned(values: Array) -> np.ndarray:
 
 
 def _values_that_fit(points: Points, joint: int, known: Fit | None = None) -> Array:
-    """Return joint values (N, dof) in which one joint's are those that fit best, with base and reflectors if known.
+    """Return joint values (N, dof) with those of one joint fitted, together with base and reflectors unless ``known``.
 
     They are within pi [rad, m].
     """
@@ -218,8 +218,8 @@ def _values_that_fit(points: Points, joint: int, known: Fit | None = None) -> Ar
 def better_interpretations(problem: CalibrationProblem, most: float = np.inf) -> list[str]:
     """Return better explanations of a table: other frames or another interpretation of some rows, or of all.
 
-    Where half of the rows agree with the nominal robot, another interpretation is sought of the others first. One of
-    all rows leaves errors of at most ``most`` [m] by the nominal robot, or a robot's part of the points' extent.
+    If half of the rows agree with the nominal robot, another interpretation of the others is sought first. One of all
+    rows has nominal errors of at most ``most`` [m], or of a robot's part of the points' extent.
     """
     points = points_of(problem) or lengths_of(problem)
     if points is None:

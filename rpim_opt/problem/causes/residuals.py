@@ -40,12 +40,12 @@ from rpim_opt.robot.mdh import Robot, numbered
 from rpim_opt.robot.parameters import of_session, tool_prefix
 
 NOTICED = 2**0.5
-"""Residuals over the noise from which on half of the squares may be explained, and no less than the noise be left."""
-MOVED = 0.5  # an instrument has moved if that leaves less than this part of the sum of squares
-SLIGHT = (5 / 6) ** 2  # what an effect that is worth a word leaves of it: errors without it are a sixth smaller
-NOISY = 3.0  # residual RMS over the stated noise above which the fit is not that of the stated instrument
-SEVERAL = 0.85  # several joint zeros moved, if that leaves less than this part of what one move leaves
-LOOSE = 4e-4  # backlash of a joint [rad, m] that no gear in order has: a quarter of that is usual
+"""Residuals over the noise from which a cause may explain half of the squares and leave no less than the noise."""
+MOVED = 0.5  # an instrument moved if that leaves less than this part of the sum of squares
+SLIGHT = (5 / 6) ** 2  # part of the squares left by an effect worth reporting: errors without it are a sixth smaller
+NOISY = 3.0  # residual RMS over the stated noise that contradicts the stated instrument
+SEVERAL = 0.85  # several joint zeros moved if that leaves less than this part of what one leaves
+LOOSE = 4e-4  # backlash of a joint [rad, m] beyond any intact gear's: a quarter of it is usual
 COUPLED = 0.004  # ratio below which a coupling of two joints is not made by gears: teeth of one over those of another
 GEARS = {
     "revolute": ("turns", "gear ratio"),
@@ -53,11 +53,11 @@ GEARS = {
 }
 """What a joint does, and what its transmission is."""
 LOADS, SINGULAR = 0.6, 1e-9
-"""What two loads leave of the residuals at most; part of the squares below which columns are the same."""
+"""Largest part of the residuals left by two loads; part of the squares below which columns are the same."""
 TWO_KINDS, STARTS = 0.4, 30
-"""Rows are of two kinds if two calibrations leave less than this part of the residuals of one; starts of the search."""
-SCATTERED = 5.0  # residuals of rows over those of the others from which on they are of another kind
-FREE = 1.0  # [m, rad] standard deviation of where touched points and planes are
+"""Largest part of the residuals left by two calibrations of two kinds of rows; starts of the search."""
+SCATTERED = 5.0  # residuals of rows over those of others that make them another kind
+FREE = 1.0  # standard deviation of positions of touched points and planes [m, rad]
 NORMAL, HEAVY, LIKELIER = 1e3, 3.0, 7.0
 """Degrees of freedom of Student's distributions of all rows; log odds at which some are of another kind (1,000:1)."""
 STEADILY = "more and more from row to row"
@@ -89,10 +89,10 @@ def _explained(
 ) -> tuple[float, Addition, Array] | None:
     """Return which part of a model's residual at x (n,) is left, by which addition, with which coefficients (c,).
 
-    Beside the parameters with their prior it must leave at most that part of the sum of squares, less than chance does
-    once in a million (F test, all additions counted): None where none does. Where lengths and angles scatter unlike
-    their stated noise the sum of squares has as many equations as a chi-squared of its mean and variance (Satterthwaite
-    1946).
+    Together with the parameters and their prior the addition has to leave at most ``left_at_most`` of the sum of
+    squares, with p-value below one in a million (F test, counting all additions): None if none does. If lengths and
+    angles scatter differently from their stated noise, the sum of squares has the degrees of freedom of a chi-squared
+    with its mean and variance (Satterthwaite 1946).
     """
     taken = _freedom(model)
     without = _without_parameters(model)
@@ -142,14 +142,14 @@ def _without_parameters(model: LinearModel) -> Callable[[Array], Array]:
 def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | None = None) -> Iterator[str]:
     """Report what one addition to the linearization at x (n,) explains best: what moved, lags or is scaled.
 
-    Added are the columns of a base for every session; of a base, fixture, reflector or joint zero for the rows from one
-    on, or between two of a few, of a joint zero from a value of the joint on as well, and of a reflector by the
-    direction of gravity at the flange; the slope of a joint's zero times the value of a joint, all of these times the
-    way from the row before, and the slopes of the scale or offset of lengths, of positions by the scales and skews of
-    their axes, too. Else backlash, rows of two kinds, noise of one column and of some rows are looked for. Nothing is
-    reported where gravity and eccentric gears explain more, which are not in the model: a lack of fit, and no mistake.
-    With ``most`` what leaves at most that part of the squares is reported, and else only backlash is looked for: a side
-    for every row raises -2 ln L by 2 ln 2. It is named in place of an addition that leaves twice as much.
+    Tried are columns of a base for every session; of a base, fixture, reflector or joint zero from a row on, or between
+    two of a few; of a joint zero also from a value of the joint on; of a reflector by the direction of gravity at the
+    flange; the derivative by a joint's zero times a joint value, and all of these times the distance from the previous
+    row; and derivatives by scale or offset of lengths, for positions by scales and skews of their axes. Otherwise
+    backlash, rows of two kinds, and noise of one column or of some rows are sought. Nothing is reported if gravity and
+    gear eccentricity outside the model explain more: that is lack of fit, no mistake. With ``most``, causes that leave
+    at most this part of the squares are reported, otherwise only backlash: a side for every row adds 2 ln 2 to -2 ln L.
+    Backlash is named instead of an addition that leaves twice as much.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
@@ -203,7 +203,7 @@ def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[st
 def wrong_gear_ratio(problem: CalibrationProblem, x: Array, most: float) -> Iterator[str]:
     """Report a gear ratio or coupling, too large for a linearization, that reduces the squares at x (n,) to a part.
 
-    All is fitted anew with it: of a ratio 3 % off a joint is 50 mrad off at its ends.
+    The fit is repeated with it: with a ratio 3 % off, a joint is 50 mrad off at its ends.
     """
     model = problem.linearize(x)
     best = _explained(model, x, problem.equations.angle, _gears(problem, model))
@@ -228,7 +228,7 @@ def wrong_gear_ratio(problem: CalibrationProblem, x: Array, most: float) -> Iter
 def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterator[Addition]:
     """Yield a base, fixture, reflector, joint zero or payload that changed, where something places the robot.
 
-    Joint zeros change at a value of the joint, too, if ``along_joints``: gears have slight steps.
+    With ``along_joints`` joint zeros also change at a value of the joint: gears have slight steps.
     """
     p, blocks = problem.parameters, problem.data.blocks
     placed = {"base": ([f"base_{c}" for c in FRAME], "did the instrument or the robot's base move")}
@@ -298,7 +298,7 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
 def _tilts(problem: CalibrationProblem, A: Array, flange: Array) -> Iterator[Addition]:
     """Yield that the base tilts by the side of the flange (N, 3), by its weight, or by the first harmonic of joint 1.
 
-    It tilts about two axes, as a turn about the first joint's own axis is that of an eccentric gear.
+    It tilts about two axes; a rotation about the first joint's axis is the effect of an eccentric gear.
     """
     p, robot = problem.parameters, problem.robot
     turns = [p.free.names.index(name) for name in ("base_rx", "base_ry", "base_rz") if name in p.free.names]
@@ -384,7 +384,7 @@ def _changes(
 def _shares(problem: CalibrationProblem, joint: int | None = None) -> Shares:
     """Return what part equations (m,) have in a change, and when: from a row on, between two rows or steadily.
 
-    Of a ``joint`` its values take the place of the rows' order: from one on, as gears' ripple is a change between two.
+    Values of a ``joint`` may replace the order of rows: from one on only, as gear ripple is a change between two.
     """
     data, owners = problem.data, problem.owners
     at, places = np.arange(len(data)), [f"row {label}" for label in data.label]
@@ -474,8 +474,9 @@ def another_robot(problem: CalibrationProblem, identified: Robot) -> Iterator[st
 def _uneven_noise(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     """Report a column of measured values whose residuals at x (n,) are far larger than those of the others.
 
-    Standard deviations s of all columns, over the stated noise, are estimated in turn with the fit of weights 1 / s^2,
-    as otherwise the noise of one is in the residuals of all: s^2 = sum r^2 / sum (1 - h), residuals r, leverages h.
+    Standard deviations s of all columns, over the stated noise, are estimated alternately with the fit with weights 1 /
+    s^2, since otherwise the noise of one is in the residuals of all: s^2 = sum r^2 / sum (1 - h), residuals r,
+    leverages h.
     """
     model = problem.linearize(x)
     columns = {tuple(block.measurement.components) for block in problem.data.blocks}
@@ -501,8 +502,8 @@ def _uneven_noise(problem: CalibrationProblem, x: Array) -> Iterator[str]:
 def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     """Report rows that scatter far more than the others, if these agree with the stated noise.
 
-    Two normal distributions, one of them the stated noise, must be far likelier than one of any width, with heavy tails
-    or without: the rows of the largest errors scatter more than the others in any sample. What parameters fit of them
+    Two normal distributions, one of them the stated noise, must be far more likely than one of any width, with or
+    without heavy tails: in any sample the rows with the largest errors scatter more. The parameters' fit to these rows
     is integrated out (Laplace).
     """
     (A, b, owners), N = _row_by_row(problem, x), len(problem.data)
@@ -558,7 +559,7 @@ def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
 def _row_by_row(problem: CalibrationProblem, x: Array) -> tuple[Array, Array, np.ndarray]:
     """Return whitened equations A z ~ b, (m, n + c) and (m,), each of one row, and these rows (m,).
 
-    Those of touches have c places of the touched points and planes, as good as free, beside the parameters.
+    For touches, c positions of touched points and planes, nearly free, are parameters, too.
     """
     touches = problem.touches
     if touches is None:
@@ -591,9 +592,9 @@ def _said_of_kinds(problem: CalibrationProblem, rows: np.ndarray, left: float) -
 def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterator[str]:
     """Report one or two joints that explain residuals at x (n,) if each is at either of two positions in every row.
 
-    They leave less than a part ``most`` of them, two joints half of what one does at most.
-    The parameters are fitted beside, with their prior. Random errors leave 60 % of the residuals, as their signs are
-    fitted then and not their sizes, and much less where there are fewer than three equations a parameter.
+    They leave less than a part ``most`` of the residuals, two joints at most half of what one does, with parameters
+    fitted and their prior. Random errors leave 60 %, since signs are fitted but not sizes, and much less with fewer
+    than three equations per parameter.
     """
     model, free = problem.with_repeatability(None).linearize(x), problem.parameters.free
     if len(model.b) < 3 * len(x):

@@ -43,8 +43,8 @@ OUTLYING = 10  # one of so many rows may be an outlier of a calibration
 def in_table_order(problem: CalibrationProblem, *apart: Dataset | None) -> CalibrationProblem:
     """Return a problem with its held-out rows put back, in the order of the table by the numbers in their labels.
 
-    The problem alone where its own labels do not increase (but for held-out rows behind the others), or parts have
-    other labels (P07_A, v7): a table of its own says nothing of neighbouring rows.
+    The problem is returned as it is if its labels do not increase (except held-out rows behind the others), or if parts
+    have other labels (P07_A, v7): a table of its own has no neighbouring rows.
     """
     parts = [problem.data, *(data for data in apart if data is not None)]
     own, *others = [[_natural(label) for label in data.label] for data in parts]
@@ -192,9 +192,9 @@ def copied_rows(data: Dataset) -> Iterator[str]:
 
 
 def filled_rows(data: Dataset) -> Iterator[str]:
-    """Report rows that were filled in: means of their neighbours, joint values or the measured point of the row before.
+    """Report rows that were filled in: means of neighbours, joint values or the measured point of the previous row.
 
-    The data are in the order of the table.
+    The data have the order of the table.
     """
     of: dict[tuple[str, tuple[str, ...]], list[Block]] = {}  # neighbours may be of several blocks
     for block in data.blocks:
@@ -256,7 +256,7 @@ def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Itera
 class Rounding(NamedTuple):
     """What is rounded, the RMS error that this causes [m], and the remedy.
 
-    Residuals are at least a part ``least`` of it; ``step`` is what every joint is rounded to, empty if not all are.
+    Residuals are at least a part ``least`` of it; ``step`` is the common resolution of all joints, empty without.
     """
 
     what: str
@@ -329,9 +329,9 @@ def every_rounding(problem: CalibrationProblem) -> Iterator[Rounding]:
 
 
 def _unit(values: Array, *steps: float) -> Array:
-    """Return to what values (N,) are rounded: 16-bit floats, a grid of such a step, or 3 or 4 digits; zeros if to none.
+    """Return the rounding of values (N,): of 16-bit floats, a grid of such a step, or 3 or 4 digits; zeros for none.
 
-    16-bit floats have 11 significant bits; of those that were written with few decimals half of the last one may miss.
+    16-bit floats have 11 significant bits; if written with few decimals, half of the last one may be missing.
     """
     size = np.abs(values)
     decimals = decimals_of(values)

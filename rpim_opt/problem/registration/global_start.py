@@ -1,9 +1,9 @@
 """Global start: joint signs, joint zeros, frames and reflectors of an arm that its nominal model does not explain.
 
-Batched multi-start Levenberg-Marquardt (`fit_arms`) over joint zeros and reflectors, the base (of lengths the anchor)
-eliminated at every step: random zeros, all signs in turn, a few steps for all and more for the best, until enough
-starts end in one optimum. There is no certificate: a better optimum that one start reaches with probability h is missed
-with (1 - h)^starts. Lengths do not distinguish an arm from its mirror image.
+Batched multi-start Levenberg-Marquardt (`fit_arms`) over joint zeros and reflectors, with the base (for lengths the
+anchor) eliminated at every step: random zeros with all signs in turn, a few steps for all and more for the best, until
+enough starts end in one optimum. There is no certificate: a better optimum that a start reaches with probability h is
+missed with probability (1 - h)^starts. Lengths do not distinguish an arm from its mirror image.
 """
 
 from __future__ import annotations
@@ -200,9 +200,9 @@ def mapped(robot: Robot, sign: Array, zero: Array) -> Robot:
 def find_mapping(problem: Source) -> tuple[JointMapping, CalibrationProblem] | None:
     """Return signs and zeros of the joints where the nominal robot fails, and the mapped problem.
 
-    Sought where the base, of lengths the anchor, and all reflectors' positions are identified: otherwise their
-    statements decide what joints are. None where nominal signs and small zeros explain the data, no mapping does, or a
-    left-handed measured frame.
+    They are sought only if the base (for lengths the anchor) and all reflectors' positions are identified: otherwise
+    the statements determine the joints. None if nominal signs and small zeros explain the data, if no mapping does, or
+    if a left-handed measured frame does.
     """
     if not isinstance(problem, CalibrationProblem):
         return None
@@ -258,9 +258,9 @@ def with_mapping(problem: CalibrationProblem, points: Points, sign: Array, zero:
 
 
 def search(points: Points, problem: CalibrationProblem | None = None) -> JointMapping | None:
-    """Return the mapping that explains the points; None if the nominal one does too, or if none does.
+    """Return the mapping that explains the points; None if the nominal one does, too, or if none does.
 
-    Of a ``problem`` a plainer one comes first that explains them as well with deviations of its prior's size.
+    With a ``problem``, a simpler mapping has priority that explains them equally well with deviations within its prior.
     """
     rng = np.random.default_rng(0)
     robot = points.robot
@@ -320,8 +320,8 @@ def _plainer(
 ) -> tuple[Array, Fit]:
     """Return signs (B, dof) and fits of mappings without zeros, or with quarter turns, that explain points as well.
 
-    That is as well as the first of the others, with deviations of the size of the problem's prior, by residuals and
-    penalty together: zeros of any size take up errors of the geometry, where joints moved little.
+    Equally well means residuals and penalty together, with deviations within the problem's prior, compared with the
+    first of the others: zeros of any size absorb errors of the geometry if joints moved little.
     """
     n = points.robot.dof
     zero = np.array([QUARTER * np.round(_gauged(points.robot, each) / QUARTER) for each in fits.zero])
@@ -381,8 +381,8 @@ class _Mappings:
     def robots(self, there: Mapping[int, Array], same: float) -> list[list[int]]:
         """Return the indices of the mappings, grouped by the robot that they describe, the best first.
 
-        Two are one robot that predict the same, to ``same`` [m], or of which a plainer one has the signs and nearly the
-        zeros of the other; so are those that a third one connects.
+        Two mappings are one robot if they predict the same, to ``same`` [m], or if the simpler one has the other's
+        signs and nearly its zeros; groups are also merged by a third mapping.
         """
 
         def alike(i: int, k: int) -> bool:

@@ -1,6 +1,6 @@
 """Measured points of an arm, and batched Levenberg-Marquardt fits of base, reflectors and joint zeros to them.
 
-Lengths from an anchor, or between two points of the arm, are fitted in the same way: the anchor is eliminated instead.
+Lengths from an anchor, or between two points of the arm, are fitted in the same way, with the anchor eliminated.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ class Candidates(NamedTuple):
     def of(cls, tries: Sequence[Points]) -> Candidates:
         """Return candidates of one robot with equal numbers of points, and stated joint zeros and reflectors.
 
-        Of poses the tips of their axes are points of further reflectors.
+        Tips of a pose's axes are points of additional reflectors.
         """
         q, y, marker, tools = (
             np.stack([getattr(points, name) for points in tries]) for name in ("q", "y", "marker", "tools")
@@ -200,12 +200,12 @@ def fit_arms(
 
         minimize  sum_i w_i |y_i - Q (p_i + R_i tau_m(i)) - t|^2 + (noise |tau_m - stated_m| / spread_m)^2
 
-    over reflectors tau and, if wanted, joint zeros o: (R_i, p_i) is the flange at q_i + o. At every step (Q, t) is
-    the registration in closed form (`proper`), and the Jacobian loses its mean over the rows and carries three columns
-    for a turn of the base, whose step is dropped.
+    over reflectors tau and, if ``zeros``, joint zeros o, with (R_i, p_i) the flange at q_i + o. At every step (Q, t) is
+    the registration in closed form (`proper`); the Jacobian is centred over the rows and has three more columns for a
+    rotation of the base, whose step is dropped.
 
-    Joint zeros are fitted where ``zeros``; weights w fall as 1 / error beyond three medians of a candidate's errors
-    where ``robust``, otherwise they are one; ``noise`` is the error of a point [m].
+    If ``robust``, weights w fall as 1 / error beyond three medians of a candidate's errors, otherwise they are one;
+    ``noise`` is the error of a point [m].
     """
     B = len(candidates.y)
     columns = 3 + 3 * len(candidates.stated) + zeros * candidates.zero.shape[1]
@@ -236,9 +236,9 @@ def fit_points(points: Points) -> Fit:
 def agreeing(points: Points) -> tuple[np.ndarray, Fit]:
     """Return which rows (N,) agree with one base and one place of each reflector, and the fit to them, of all rows.
 
-    Least trimmed squares for the nominal robot: few rows at random, or next to each other, are fitted, then twice the
-    third of the rows that the best such fits are nearest to, and last all rows that are as near as these. It finds a
-    third of the rows wherever they are, and whatever is wrong with the others.
+    This is least trimmed squares for the nominal robot: a few random or consecutive rows are fitted, then twice the
+    third of the rows closest to the best of these fits, and last all rows that are as close. It finds a consistent
+    third of the rows wherever it is, and whatever is wrong with the others.
     """
     N = len(points.row)
     size = min(4 + len(points.tools) + 4 * points.lengths, N)
