@@ -144,7 +144,7 @@ class Prior:
     def where_known(self, stated: Parameters, found: Parameters) -> Parameters:
         """Return the located parameters, with known frames and known parameters at their stated values.
 
-        This holds for orientations, and for frames whose stated scale is not wider than that of the table.
+        This also holds for orientations, and for frames whose stated scale is not wider than that of the table.
         """
         own = overlay(stated, np.full(len(stated), np.nan), self.scale, "prior, table scale")
         known = {name for each in self.statements if not each.whole for name in each.names}

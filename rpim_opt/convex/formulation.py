@@ -31,7 +31,7 @@ class Formulation(Brief):
         minimize    loss(A z - b) + weight * penalty(z)     subject to    constraints(z)
 
     The functions may hold variables and parameters of their own, and read anything: a calibration calls them twice, for
-    its iterations and for its certificate, and twice per iteration if constraints use positions. With data in blocks
+    its iterations and for its certificate, and twice per round if constraints use positions. With data in blocks
     the loss is called in every linearization, for some thousand rows at a time, and not for the certificate.
 
     Parameters

@@ -107,7 +107,7 @@ class Program(Brief):
     >>> [round(e.penalty, 1) for e in program.path([0.5, 5.0, 50.0])]
     [13.4, 12.5, 10.4]
     >>> there = program.on(problem.linearize(estimate.z * problem.parameters.free.scale))
-    >>> round(estimate.loss), round(there.value(estimate.z)[0])  # loss of the linear model, and of the nonlinear one
+    >>> round(estimate.loss), round(there.value(estimate.z)[0])  # promised, and what the nonlinear model keeps
     (97, 100)
     """
 
@@ -350,7 +350,7 @@ class Program(Brief):
         constraints move them.
 
         ``damping`` is a term that keeps the solution near a point. If ``solver``, ``settings`` or ``verbose`` is given,
-        CVXPY solves `problem` with that solver (default Clarabel), whatever its structure; without them, if loss and
+        CVXPY solves `problem` with that solver (default Clarabel), whatever its structure; it also does if loss and
         constraints share own variables.
 
         InputError for a weight that is negative or not finite, and a solver that is not installed. NoSolutionFound if

@@ -98,7 +98,7 @@ def choose(
 
         D   maximize ln det M
         A   minimize tr M^-1
-            V   minimize the mean variance of the candidates' positions, summed over the axes [m^2]
+        V   minimize the mean variance of the candidates' positions, summed over the axes [m^2]
 
     If the problem's rows touch points, the candidates are configurations at one point (`configurations_at`), and V
     refers to positions of the tool.

@@ -166,8 +166,7 @@ def require_same_arm(robot: Robot, original: Robot, file: Path) -> list[str]:
 def joint_values(robot: Robot, original: Robot, file: Path) -> list[str]:
     """Return a sentence on how the values of a file's joints follow from the controller's, if they differ.
 
-    With F (n, k) the joint map of the file and M that of the robot they are S q, where F S = M; refused without such an
-    S.
+    With F (n, k) the joint map of the file and M that of the robot they are S q, F S = M; refused if S does not exist.
     """
     S = np.round(np.linalg.pinv(original.joint_map) @ robot.joint_map, 12)
     wrong = np.flatnonzero(np.abs(original.joint_map @ S - robot.joint_map).max(axis=1) > 1e-9)

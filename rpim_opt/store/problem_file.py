@@ -77,7 +77,7 @@ def find_problem(name: str | Path) -> Path:
     if path.is_dir():
         return path
     known = sorted(p.name for p in problems_folder().iterdir() if (p / "problem.toml").is_file())
-    if name in known:  # only folders are paths
+    if name in known:  # never a path: that is a folder
         return problems_folder() / str(name)
     accepted = "a folder with problem.toml, or " + choices(str(name), known)
     raise InputError("the problem", f"no folder '{name}'", accepted)

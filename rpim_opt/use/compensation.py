@@ -271,7 +271,7 @@ def compensate(
     rad^-2. The same applies to all targets if the standard uncertainty of any orientation exceeds its w, since
     positions of one reflector hardly determine it; w is then the change of orientation by the correction, so that rows
     of a program do not rotate relative to each other. ``orientation=True`` corrects all orientations, at the cost of
-    positions if both are unattainable; with ``False`` orientations of targets are ignored.
+    positions if not both are attainable; with ``False`` orientations of targets are ignored.
 
     **Tool.** Both robots have the same tool, so that differences of tools are not compensated: ``tool`` (6,) in the
     flange frame, x, y, z [m], roll, pitch, yaw [rad], the controller's TCP, or by default the identified reflector of
@@ -753,8 +753,8 @@ def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:
 def attainable(J: Array) -> Array:
     """Return matrices W (N or 1, k, k) that project errors on the attainable ones, from Jacobians (N, k, n).
 
-    With six joints or more, or positions only, all errors are. With fewer, position has priority: of the orientation
-    count rotations without motion of the point, which gives as many equations as joints.
+    With six joints or more, or positions only, all are. With fewer, position has priority, and of the orientation
+    only rotations that do not move the point count: as many equations as joints.
     """
     k, n = J.shape[1:]
     if n >= k or k == 3:

@@ -133,8 +133,7 @@ def export_files(
 ) -> Exported:
     """Export the identified robot to files of other tools: all of them, or none.
 
-    For a calibration with more than geometry `geometry_alone` is written, with its transmission errors in
-    ``corrections``.
+    Of a calibration with more than geometry `geometry_alone` is written; ``corrections`` are of the whole model.
 
     ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS), ``ur_calibration`` (``calibration.conf``) and
     ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot that are corrected and written to ``out``, a

@@ -444,7 +444,7 @@ def _bases(result: Calibration, updated: Calibration, data: Dataset) -> str:
 def _with_scales_of_motion(
     result: Calibration, updated: Calibration, released: tuple[str, ...], inflation: float
 ) -> Calibration:
-    """Return the update with released frames within their scales of nominal, by moving the nominal values.
+    """Return the update with the scales of released frames enlarged to their distances from nominal.
 
     A reset base is far beyond its scale, which later tests would take for a deviation of the robot.
     """

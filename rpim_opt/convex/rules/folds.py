@@ -30,7 +30,7 @@ ASIDE = 1e-3
 """Constant residual of held-out rows, in units of the noise, for a loss that is no sum over rows. At zero, where norms
 and the loss's own variables are all non-smooth at once, an interior-point method stalls."""
 DROPPED = 1e-13
-"""Added to 1 - H_gg of a configuration: below, nothing else determines it."""
+"""Added to 1 - H_gg: a configuration for which that is smaller is determined by no other one."""
 
 
 @on_inliers
@@ -87,10 +87,10 @@ def two_step(program: Program) -> Selection:
     """Choose by the paper's two steps: a coarse L-curve, then held-out error (section III B and Figs. 7 to 10).
 
     1. From the corner down, 30 weights over ten decades. The residual norm falls with the weight, so its
-             minimum is always the smallest weight; what the paper reads off its Fig. 7 is where the decrease ends:
-             the first weight from which one more step lowers the residual norm by less than 1 %.
+       minimum is always the smallest weight; what the paper reads off its Fig. 7 is where the decrease ends:
+       the first weight from which one more step lowers the residual norm by less than 1 %.
     2. Ten weights within the same order of magnitude, 0.184 to 1.653 times that (the paper's 0.563e-14 to
-             5.063e-14 around 3.063e-14), compared by held-out error, with every configuration held out once.
+       5.063e-14 around 3.063e-14), compared by held-out error, with every configuration held out once.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.two_step)

@@ -155,7 +155,7 @@ def _equations(
 
         v = (t, u, 1, vec Z_R, vec X_R'),  rotations' rows first,    t = X_t,  u = Z_R' Z_t
         (Z_R' y - A_R t - A_t - u) / sigma_position
-            (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    if the orientation was measured
+        (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    if the orientation was measured
 
     The norm of the last is the angle between the two, up to third order. X_R is left out without orientations.
     """

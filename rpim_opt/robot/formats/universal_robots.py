@@ -155,7 +155,7 @@ def read_ur_kinematics(path: str | Path) -> RobotSetup:
     the frame of the previous one, x y z [m] and roll pitch yaw [rad], and ``hash``, which identifies the robot
     (UniversalRobots/Universal_Robots_ROS_Driver, ur_calibration; read by ros-industrial/universal_robot,
     ur_description). ur_description puts the angles into a URDF, where they mean R = Rz Ry Rx, as here. ur_calibration
-    computes them for R = Rx Ry Rz: a controller's file is therefore accurate only to the product of two of its small
+    computes them for R = Rx Ry Rz: a controller's file is therefore accurate only to the product of its small yaw
     angles (about 1e-4 rad) and the reach; `read_ur_calibration` has no such loss.
 
     >>> import rpim_opt as ro
