@@ -821,6 +821,10 @@ BAD = {
     ),
     "no reflector": (["export", *RESULT, "--mdh", "made.csv", "--marker", "B"], ["marker", "'B'"]),
     "no targets": (["compensate", *RESULT, "nothing.csv"], ["nothing.csv", "the file: found nothing"]),
+    "a program": (
+        ["compensate", *RESULT, "joints.csv", "--units", "rad", "--out", "targets.ls"],
+        ["--out", "found 'targets.ls'", "no program of a controller is written"],
+    ),
     "bad tool": (["compensate", *RESULT, "joints.csv", "--units", "rad", "--tool", "1,2"], ["--tool", "six numbers"]),
 }  # fmt: skip
 

@@ -339,6 +339,14 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
         dh_table(lambda mdh: mdh[:, [0, 3, 2, 1, 4]]),
         "columns a and d of the DH table exchanged",
     ),
+    "columns a and d of a standard table exchanged": (  # a of a row is that of the next one here
+        dh_table(
+            lambda mdh: np.column_stack(
+                [mdh[:, 0], np.append(0, mdh[:-1, 3]), mdh[:, 2], np.append(mdh[1:, 1], 0), mdh[:, 4]]
+            )
+        ),
+        "columns a and d of the standard DH table exchanged",
+    ),
     "rows of the DH table exchanged": (
         dh_table(lambda mdh: mdh[[0, 1, 2, 4, 3, *range(5, len(mdh))]]),
         "rows 4 and 5 of the DH table exchanged",

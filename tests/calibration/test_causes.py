@@ -77,6 +77,7 @@ QUICK = {
         "azimuths and elevations exchanged",
         "a lens",
         "columns a and d exchanged",
+        "columns a and d of a standard table exchanged",
         "columns of a differential",
         "thousands read as decimals",
         "the reflector before the last joint",
@@ -829,6 +830,15 @@ def test_rows_that_all_scatter_alike_are_of_one_kind(name: str) -> None:
     assert alike == 0
     assert apart >= 7
     assert np.mean(right) > 0.9
+
+
+def test_the_travel_of_a_linear_joint_measures_the_scale_of_the_instrument_too() -> None:
+    """A gear ratio of a joint that "turns" was named alone."""
+    problem = ro.load("scara").problem
+    (block,) = problem.data.blocks
+    scaled = problem.on(replace(problem.data, blocks=(replace(block, y=1.004 * block.y),)))
+    (reason,) = ro.calibrate(scaled, model="auto").verdict.reasons
+    assert re.match(r"Likely: joint 3 moves 0.4\d* % more than its encoder reads \(.* or the scale of the inst", reason)
 
 
 def test_a_gear_ratio_is_named_though_curves_take_it_up() -> None:
