@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.robot import read_robot
@@ -442,6 +443,13 @@ def grown(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
     return values(lambda y: y + 1e-3 * np.linspace(0, 1, COUNT)[:, None] * growth)(problem)
 
 
+def seen_from_the_reflector(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Measure where the instrument is in a frame that turns with the nominal flange."""
+    R = ro.robot.forward_kinematics(problem.robot, problem.data.q)[:, :3, :3]
+    base = Rotation.from_euler("xyz", problem.parameters.nominal[problem.parameters.frame("base_")][3:]).as_matrix()
+    return values(lambda y: -np.einsum("nji,nj->ni", base @ R, y))(problem)
+
+
 def of_two_sides(q: np.ndarray) -> np.ndarray:
     """Return joint values of which the first two are on either side of their play of 2 mrad."""
     return q + 1e-3 * np.random.default_rng(4).choice([-1, 1], q.shape) * (np.arange(q.shape[1]) < 2)
@@ -479,6 +487,10 @@ IN_TABLES |= {
     ),
     "commanded degrees": (commanded, "these are commanded joint values"),
     "worn circles of the instrument": (values(of_worn_circles), "angles of the instrument at the origin"),
+    "inverse poses without orientations": (
+        seen_from_the_reflector,
+        "inverse poses (the instrument in the reflector's frame)",
+    ),
     "a filter of the instrument": (
         values(lambda y: np.vstack([y[:1], 0.998 * y[1:] + 0.002 * y[:-1]])),
         "measured positions lag behind by 0.2 % of each move",

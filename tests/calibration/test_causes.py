@@ -104,6 +104,7 @@ QUICK = {
         "z a column of RMS",
         "joint 2 frozen halfway",
         "joint 3 from the horizontal, and three joints reversed",
+        "inverse poses without orientations",
     ],
     "iiwa7": [
         "a column in centimetres",
