@@ -190,6 +190,11 @@ class Robot(Brief):
         return tuple(int((rows if len(rows) else other)[0]) for rows, other in zip(unit, moved, strict=True))
 
     @property
+    def zeros(self) -> list[str]:
+        """Names of the parameters that the zeros of the model's joints are."""
+        return [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(self.joint_types, start=1)]
+
+    @property
     def joint_dimensions(self) -> tuple[str, ...]:
         """``"angle"`` for a revolute joint of the controller, ``"length"`` for a prismatic one."""
         return tuple("angle" if self.joint_types[i] == "revolute" else "length" for i in self.leading)

@@ -41,7 +41,6 @@ from rpim_opt.robot.chain import placed, same_place
 from rpim_opt.robot.kinematics import FRAME, frame_numbers
 from rpim_opt.robot.parameters import (
     Parameters,
-    is_joint_offset,
     of_session,
     reflectors,
     session_prefix,
@@ -736,12 +735,13 @@ def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -
     """
     free, data = problem.parameters.free, problem.sample().data
     place, measured = registration(free, data), {tool_prefix(m) for block in data.blocks for m in block.markers}
+    zeros = {problem.parameters.called(which, zero) for which, arm in problem.arms.items() for zero in arm.zeros}
     causes = []
     wholes: dict[tuple[str, str], list[str]] = {}
     for name, frame, curve in zip(free.names, free.of_frames, free.of_curves, strict=True):
         if name in reset or (of_session(name) and not name.startswith(place)):  # an earlier session has ended
             continue
-        kinds = {"frame": frame, "transmission error": curve, "joint offset": is_joint_offset(name), "parameter": True}
+        kinds = {"frame": frame, "transmission error": curve, "joint offset": name in zeros, "parameter": True}
         kind = next(kind for kind, holds in kinds.items() if holds)
         if frame or curve:
             wholes.setdefault((name.rpartition("_")[0], kind), []).append(name)
@@ -759,12 +759,11 @@ def _of_arms(problem: Source, bent: bool) -> Iterator[Cause]:
     """Yield motors that move several joints; if bent, two joint zeros, and the numbers between two joints."""
     names = problem.parameters.free.names
     for which, arm in problem.arms.items():
-        zeros = [("d" if kind == "prismatic" else "theta") + str(i) for i, kind in enumerate(arm.joint_types, 1)]
         for motor, column in enumerate(arm.joint_map.T):
-            moved = [problem.parameters.called(which, zeros[k]) for k in np.flatnonzero(column)]
+            moved = [problem.parameters.called(which, arm.zeros[k]) for k in np.flatnonzero(column)]
             if len(moved) > 1:
                 yield Cause(f"motor {arm.joint(motor)} ({joined(moved)})", "joint offset", tuple(moved))
-        free = [name for name in (problem.parameters.called(which, zero) for zero in zeros) if name in names]
+        free = [name for name in (problem.parameters.called(which, zero) for zero in arm.zeros) if name in names]
         for pair in [*combinations(free, 2)] * bent:  # two motors that were exchanged
             yield Cause(joined(pair), "joint offsets", pair)
         for i in range(1, len(arm.mdh) * bent):

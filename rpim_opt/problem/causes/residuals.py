@@ -175,7 +175,7 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
         return
     # zeros of all joints fit two gross errors, whatever these are, but no more
     what, cause = "set of joint zeros", "did several joints slip, or were they remastered"
-    changes = _changes(problem, x, model.A, _zeros(problem.robot), what, cause, _shares(problem))
+    changes = _changes(problem, x, model.A, problem.robot.zeros, what, cause, _shares(problem))
     several = _explained(model, x, angle, changes, most)
     if several is not None and several[0] < SEVERAL * left:
         best, left = several, several[0]
@@ -259,7 +259,7 @@ def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterato
         yield Addition(apart.reshape(len(A), -1), lambda c: (between, remedy))
     for what, (changed, cause) in parts.items():
         yield from _changes(whole, there, A, changed, what, cause, shares)
-    for i, name in enumerate(_zeros(problem.robot)):
+    for i, name in enumerate(problem.robot.zeros):
         cause = "did the joint slip or fall back under its load, or was it remastered"
         by = shares | (_shares(problem, i) if along_joints else {})
         zero = f"zero of joint {numbered(i, problem.robot.joint_names)}"
@@ -600,7 +600,7 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
     if len(model.b) < 3 * len(x):
         return
     r, without = model.b - model.A @ (x / free.scale), _without_parameters(model)
-    joints = [(i, free.names.index(name)) for i, name in enumerate(_zeros(problem.robot), 1) if name in free.names]
+    joints = [(i, free.names.index(name)) for i, name in enumerate(problem.robot.zeros, 1) if name in free.names]
     joints = [(i, k) for i, k in joints if model.A[:, k].any()]
     best, alone, said = most, np.inf, ""
     for some in [*combinations(joints, 1), *combinations(joints, 2)]:
@@ -693,17 +693,12 @@ def _either_side(
     return float(np.linalg.norm(target - columns @ found) / max(np.linalg.norm(r), TINY)), found, chosen
 
 
-def _zeros(robot: Robot) -> list[str]:
-    """Return the names of the parameters that joint zeros are."""
-    return [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(robot.joint_types, start=1)]
-
-
 def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition]:
     """Yield every gear ratio and coupling, and a lag of all joints."""
     robot, free = problem.robot, problem.parameters.free
     slopes = model.A / free.scale
     q = problem.joint_values
-    of_zero = {i: slopes[:, free.names.index(name)] for i, name in enumerate(_zeros(robot)) if name in free.names}
+    of_zero = {i: slopes[:, free.names.index(name)] for i, name in enumerate(robot.zeros) if name in free.names}
 
     def joint_map(i: int, j: int, coefficients: Array) -> Array:
         to_model = robot.joint_map.copy()
