@@ -59,6 +59,7 @@ STAYING = 1e-2
 beside released parameters, that is kept constant."""
 MOST = 4  # most successive changes of robot and frames: with more it is another robot
 FEW = 2  # more changes than this may be one of a link
+ANOTHER = 2e-3  # change of a frame's coordinate [m, rad] above which it is another frame
 SPARED = 0.25  # largest share of wrong readings
 STRANGE = 5.0  # error over that before any calibration, above which unexplained readings are of another robot
 RIVAL, AS_GOOD = 0.05, 4.0  # of a further cause to be named: probability, or chi-squared above the best
@@ -519,15 +520,20 @@ def _moved(
 ) -> tuple[Moved, ...]:
     """Return the movements of released parameters, except curves' coefficients; those of reset ones from both results.
 
-    For changed parameters the uncertainty common to both results does not count.
+    For changed parameters the uncertainty common to both results does not count; for a frame that is another one, as
+    that of a new tool, it does, since the orientation in which it is stated is uncertain, too.
     """
     free = updated.problem.parameters.free
     curves = np.array(free.names)[free.of_curves].tolist()
-    members = [name for cause in changes if cause.kind != "reading" for name in cause.members]
-    changed = [name for name in members if name not in curves]
-    reset = [name for name in released if name not in changed]
     # deviations of a registered frame refer to another orientation, values do not
     was, now = (each.problem.parameters.by_name(each.x) for each in (result, updated))
+
+    def another(cause: Cause) -> bool:
+        far = (abs(now[name] - was.get(name, now[name])) > ANOTHER for name in cause.members)
+        return cause.kind == "reading" or (cause.kind == "frame" and any(far))
+
+    changed = [name for cause in changes if not another(cause) for name in cause.members if name not in curves]
+    reset = [name for name in released if name not in changed]
     moved: list[Moved] = []
     for name in [name for name in reset if name in result.problem.parameters.free.names and name not in curves]:
         i = free.names.index(name)

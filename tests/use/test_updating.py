@@ -400,6 +400,8 @@ def test_new_reflectors_in_the_place_of_some_are_one_change() -> None:
     assert [cause.name for cause in found.changes] == ["all reflectors"]
     assert not any(name.startswith(f"tool_{unmeasured.markers[0]}_") for name in found.changes[0].members)
     assert found.result.verdict.delivered
+    known = dict(zip(names, np.sqrt(np.diag(first.covariance)), strict=True))  # in an orientation that is not known
+    assert all(each.std > known[each.name] for each in found.moved)
     named = r"'X', accepted: .*; of a new reflector the name of one before, and reset 'tool_NAME_\*'"
     with pytest.raises(InputError, match=named):
         ro.use.update(first, ro.Dataset.of(data.q[:8], np.zeros((8, 3)), SIGMA, marker=["X"] * 8))
