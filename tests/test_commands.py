@@ -564,6 +564,17 @@ def test_new_says_that_a_robot_file_was_exported_from_a_calibration(made: Path, 
     assert "rpim-opt update RESULTS TABLE" in note
 
 
+@pytest.mark.parametrize(("rail", "ignored"), [(50.0, {"ignored_joints": "E1 [mm]"}), (0.0, {})])
+def test_a_rail_that_moves_is_ignored_aloud(cell: Path, tmp_path: Path, rail: float, ignored: dict[str, str]) -> None:
+    """Its column had "an unknown name", and calibrate blamed the rows' order; where it stands still it is no word."""
+    q = np.random.default_rng(2).uniform(-2, 2, (20, 6))
+    rows = np.hstack([urdf_points(cell / "arm.urdf", q), q, rail * np.arange(20)[:, None]])
+    write_csv(tmp_path / "a.csv", [*HEADER, "E1 [mm]"], rows)
+    options = TableOptions(units=parse_units("rad,m"))
+    ro.store.new_problem(tmp_path / "arm", cell / "arm.urdf", tmp_path / "a.csv", options=options)
+    assert ro.load(tmp_path / "arm").record.details == ignored
+
+
 @pytest.mark.slow
 def test_joint_values_that_are_ignored_are_a_likely_cause(monkeypatch, capsys, cell, tmp_path) -> None:
     monkeypatch.chdir(tmp_path)

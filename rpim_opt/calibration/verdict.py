@@ -603,7 +603,7 @@ def likely_causes(result: Outcome) -> list[str]:
         causes = first(computed_columns(problem), *explanations, _residual_causes(result, problem, ordered))
         ignored = result.record.details.get("ignored_joints")
         if ignored:
-            state = "if these move the tool, state another robot, or a tip link beyond them (--urdf-tip)"
+            state = "if these move the tool, state another robot (a rail is its first joint), or a tip link beyond them"
             causes.insert(0, f"joint values {ignored} are ignored (the robot has {problem.robot.dof} joints): {state}.")
         shared += together
     elif (other := _other_robot(result, problem)) is not None:

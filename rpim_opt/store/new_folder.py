@@ -22,6 +22,7 @@ from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, Board, grid_b
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.tables.names import recognize
 from rpim_opt.data.tables.reading import read_data
+from rpim_opt.data.tables.understanding import EXTERNAL
 from rpim_opt.problem.causes.rows import rows_without_values
 from rpim_opt.problem.multi_robot import NAME
 from rpim_opt.problem.problem import CalibrationProblem, identifiable
@@ -208,15 +209,18 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Interpretation, rows:
     if further:
         yield (
             f"Ignored joint values: {further}. The robot ({arm.robot.source or arm.robot.name}) has {arm.robot.dof} "
-            "joints; if these move the tool, state another robot, or a tip link beyond them (--urdf-tip)."
+            'joints; if these move the tool, state another robot (a rail is its first joint, type = "prismatic"), or '
+            "a tip link beyond them (--urdf-tip)."
         )
     yield from (f"{text[0].upper()}{text[1:]}" for text in rows_without_values(rows, {"": arm.robot}))
 
 
 def _ignored_joints(arm: RobotSetup, understanding: Interpretation) -> str:
-    """Return the columns of joints behind the robot's last one; empty if there are none."""
+    """Return the columns of joints behind the robot's last one, or of an external axis that moved; empty without."""
     beyond = {f"q{i}" for i in range(arm.robot.dof + 1, arm.robot.dof + 9)}
-    further = [name for name in understanding.left_out if recognize(split(name)[0], arm.names).stem in beyond]
+    stems = {name: recognize(split(name)[0], arm.names).stem for name in understanding.left_out}
+    moved = {name for name in stems if len({*understanding.raw.get(name.lower(), ())}) > 1}
+    further = [n for n, stem in stems.items() if stem in beyond or (n in moved and EXTERNAL.fullmatch(stem))]
     return joined(further) if further else ""
 
 
