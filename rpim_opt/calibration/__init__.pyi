@@ -15,5 +15,6 @@ from .outcome import Prediction as Prediction
 from .result import Calibration as Calibration
 from .uncertainty import Uncertainty as Uncertainty
 from .uncertainty import monte_carlo as monte_carlo
+from .uncertainty import transmission_errors as transmission_errors
 from .verdict import Verdict as Verdict
 from .verdict import likely_causes as likely_causes
