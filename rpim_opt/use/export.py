@@ -237,6 +237,7 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         return problem.with_parameters(replace(p, nominal=nominal, identified=np.isin(p.names, free) & ~zero))
 
     learned, penalty = result.learned, result.formulation.penalty
+    known: dict[str, Any] = {"causes": result.causes}  # the extension is no mistake
     selected, added = ((), ()) if learned is None else (learned.extensions, learned.added)
     left_out = {row.label for row in result.left_out}
     lost = [each for each in selected if each not in CONDITIONS]
@@ -253,10 +254,13 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
             again = calibrate(alone.problem.on(stated.data), alone.formulation, weight=alone.weight)
             alone = replace(again, learned=replace(alone.learned, left_out=()))
     else:  # a prior of all parameters, in units of their scales: unchanged, with those beyond geometry at zero
-        among = np.eye(len(free))[:, ~np.isin(free, list(beyond))]
+        kept = ~np.isin(free, list(beyond))
+        among = np.eye(len(free))[:, kept]
         form = replace(result.formulation, penalty=lambda z: penalty(among @ z))
         alone = calibrate(bare(result.problem), form, weight=result.weight)
-    alone = replace(alone, record=result.record, known={"causes": result.causes})  # the extension is no mistake
+        if learned is not None:  # what the prior holds in place is as uncertain as before
+            known["fit_covariance"] = replace(alone.fit_covariance, drift=learned.drift[kept])
+    alone = replace(alone, record=result.record, known=known)
     where, data = next(iter(sets(result).items()))
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))
     sentence = (

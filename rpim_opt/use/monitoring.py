@@ -33,6 +33,7 @@ ALLOWANCE = 0.5  # CUSUM's reference value k, subtracted from every deviate: fas
 CELLS = 150  # steps of a sum's range in the Markov chain of its distribution
 HIGHEST_LIMIT = 50.0
 SET_UP_ANEW = 3.0  # factor of errors without over with registration of every set-up, from which set-ups have moved
+DAY = 86400.0  # seconds
 NEARLY = 0.9  # share of chi-squared explained beyond linearization, for instance by another place of the base
 MOTION = 1.0  # prior standard deviation of a motion determined from the checks [m, rad]
 
@@ -217,18 +218,26 @@ def monitor(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
         allowed=np.sqrt(equations * fdtri(equations, max(result.noise_dof, 1.0), 1 - level / count)),
         sums=cusum(deviate * right), limit=cusum_limit(count, level), drift=drift, wrong=wrong, registered=motion,
-        mistake=_mistake(result, data, right, register, drift),
+        mistake=_mistake(result, data, when, right, register, drift),
     )  # fmt: skip
 
 
-def _mistake(result: Calibration, data: Dataset, right: np.ndarray, register: bool, drift: Drift | None) -> str:
+def _mistake(
+    result: Calibration, data: Dataset, when: Array | None, right: np.ndarray, register: bool, drift: Drift | None
+) -> str:
     """Return a likely mistake in checks (N,), or a motion by those that are right if drift may be one; or nothing."""
-    names = set_ups(result, data)
+    names, apart = set_ups(result, data), data
+    between, remedy = f"sessions {listed(names)}", "Use --register"
+    if len(names) < 2 and when is not None and drift is None:
+        days = (when // DAY).astype(str)
+        apart = replace(data, blocks=tuple(replace(each, session=days[each.row]) for each in data.blocks))
+        names = [*{*days}]
+        between, remedy = "days", "Name its set-ups in a column `session`, and use --register"
     if len(names) > 1:
         with suppress(InputError):
-            again = registered_again(result, data)[0]
+            again = registered_again(result, apart)[0]
             if SET_UP_ANEW * rms(result.errors(again)) < rms(result.errors(data)):
-                return f"Likely: the instrument or the base moved between sessions {listed(names)}. Use --register."
+                return f"Likely: the instrument or the base moved between {between}. {remedy}."
     found = misread(result, data)
     data = data.take(np.flatnonzero(right))
     moved = drift is None or (not register and (drift.cause.kind == "frame" or drift.others))
