@@ -387,6 +387,8 @@ class Outcome:
         if self.moves is not None:  # conditional on the active constraints
             form = ridge_within(self.squares, self.program.penalty_form, self.moves, self.z)
         level, drift = (None, None) if self.learned is None else (1.0, self.learned.drift)
+        if len(self.record.opened):
+            drift = self.record.opened if drift is None else np.hstack([drift, self.record.opened])
         return FitCovariance(self.squares, form, self.penalty_weight, self.z, level, drift)
 
     @property

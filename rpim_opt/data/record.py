@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import NamedTuple
 
+import numpy as np
 from scipy.special import fdtrc
 
 from rpim_opt.basics.arrays import Array
@@ -166,7 +167,8 @@ class Record:
     while validation data are unused; ``earlier`` are the calibrations that this one continues (`use.update`), latest
     last; ``digest`` is that of the file that the record was read from. Later tables are read with the options
     ``reading`` (`TableOptions.stated`); ``terms`` are those of a Python file in the problem's folder, ``mine:droop``;
-    ``known`` are stated parameter values in the prior.
+    ``known`` are stated parameter values in the prior. D D' of ``opened`` (n, k) is the covariance [SI] of what an
+    update left where it was.
 
     >>> import rpim_opt as ro
     >>> record = ro.data.Record("Cell 7", source="Tracker campaign of May", excluded={"P17": "reflector bumped"})
@@ -191,6 +193,7 @@ class Record:
     reading: Mapping[str, str] = field(default_factory=dict)
     terms: tuple[str, ...] = ()
     known: tuple[str, ...] = ()
+    opened: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def identity(self) -> str:

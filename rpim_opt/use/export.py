@@ -258,8 +258,8 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         among = np.eye(len(free))[:, kept]
         form = replace(result.formulation, penalty=lambda z: penalty(among @ z))
         alone = calibrate(bare(result.problem), form, weight=result.weight)
-        if learned is not None:  # what the prior holds in place is as uncertain as before
-            known["fit_covariance"] = replace(alone.fit_covariance, drift=learned.drift[kept])
+        if (drift := result.fit_covariance.drift) is not None:  # what the prior holds is as uncertain as before
+            known["fit_covariance"] = replace(alone.fit_covariance, drift=drift[kept])
     alone = replace(alone, record=result.record, known=known)
     where, data = next(iter(sets(result).items()))
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))

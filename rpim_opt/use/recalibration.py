@@ -284,7 +284,7 @@ def update(
     held_out = None if {*released} - {*unplaced} else result.record.validation  # measured before a change
     figures, said = _errors(result, updated, held_out)
     registered = " ".join(filter(None, [_bases(result, updated, data) if anywhere else "", said]))
-    updated = replace(updated, record=_carried_on(result.record, last, source))
+    updated = replace(updated, record=_carried_on(result.record, last, source, updated.record.opened))
     return Update(updated, first[1], after, changes, first[0], moved, len(data), figures, registered, vague)
 
 
@@ -377,7 +377,7 @@ def _errors(
     return {name: each for name, each in figures.items() if each["after"]["count"]}, said  # those with lengths
 
 
-def _carried_on(record: Record, last: Earlier, source: str) -> Record:
+def _carried_on(record: Record, last: Earlier, source: str, opened: Array) -> Record:
     """Return the record of an updated calibration: of the earlier one what holds for the new measurements, too."""
     first_source = record.source.rpartition(BEFORE)[2]  # notes on a file belong to its own measurements
     return Record(
@@ -391,6 +391,7 @@ def _carried_on(record: Record, last: Earlier, source: str) -> Record:
         earlier=(*record.earlier, last),
         reading=record.reading,
         terms=record.terms,
+        opened=opened,
     )
 
 
@@ -680,9 +681,11 @@ def _recalibrated(
             local=np.append(learned.local, np.ones(len(more))),
             drift=np.zeros((len(updated.x), 0)),  # the prior contains the uncertainty of the scales
         )
-        rows = _staying(result, problem, previous_deviations(result, problem), released)
-        learned = replace(learned, drift=_opened(replace(updated, learned=learned).covariance, rows))
-    return replace(updated, learned=learned, calibrate_again=partial(calibrate, formulation=formulation, weight=1.0))
+    rows = _staying(result, problem, previous_deviations(result, problem), released)
+    updated = replace(updated, learned=learned, calibrate_again=partial(calibrate, formulation=formulation, weight=1.0))
+    fit = updated.fit_covariance  # in units of the noise that it finds
+    opened = _opened(fit.covariance, rows / np.sqrt(fit.noise_variance * fit.linear.factor))
+    return replace(updated, record=replace(updated.record, opened=opened))
 
 
 # --- every parameter, frame and reading as a cause of a misfit ----------------------------------------------

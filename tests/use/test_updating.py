@@ -385,6 +385,25 @@ def test_nominal_errors_are_of_all_reflectors_after_an_update_by_one(tmp_path) -
     np.testing.assert_allclose(loaded.nominal_errors(), updated.nominal_errors(), rtol=1e-6)
 
 
+@pytest.mark.parametrize("weight", [{}, {"weight": 1.0}], ids=["estimated", "a weight"])
+def test_an_update_makes_nothing_certain_that_no_configuration_shows(tmp_path, weight) -> None:
+    """That stays where it was; files without gravity stated an orientation to 1.8 mrad that was 5 mrad off."""
+    problem = ro.load("position").problem
+    p, rows = problem.parameters, np.arange(len(problem.data))
+    sagging = problem.identifying(p.identified | np.char.startswith(np.array(p.names), "compliance"))
+    first = ro.calibrate(sagging.on(problem.data.take(rows[:30])), **weight)
+    updated = ro.use.update(first, problem.data.take(rows[30:])).result
+    ro.store.save_result(updated, tmp_path)
+    alone = ro.use.geometry_alone(updated)[0]
+    assert len(alone.x) < len(updated.x)
+
+    def std(result: ro.calibration.Calibration) -> float:
+        return float(np.sqrt(np.diag(result.covariance))[result.problem.parameters.free.names.index("theta6")])
+
+    for each in (updated, ro.load_result(tmp_path), alone):
+        assert std(each) > 0.5 * std(first)
+
+
 def test_new_reflectors_in_the_place_of_some_are_one_change() -> None:
     """The others were released, too, and undetermined: the update was refused, with advice on --reset."""
     problem = simulated_arm("ur5e", count=50, markers=3)
