@@ -68,7 +68,8 @@ def registered_again(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
             raise InputError(", ".join(where), error.found, error.accepted) from None
         moved = {"": "the measurements were"}.get(name, f"session {name!r} was")
         motions.append(f"{moved} {motion}")
-    return data, f"Registered again: {listed(motions, between='; ')}."
+    hidden = "A changed zero of joint 1 looks like such a motion, and would not be found."
+    return data, f"Registered again: {listed(motions, between='; ')}. {hidden}"
 
 
 def _sessions(result: Calibration, robot: str) -> dict[str, bool]:
