@@ -75,7 +75,7 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
         result, record=dataclasses.replace(result.record, requirement=ro.data.Requirement(0.01))
     )
     page = report.page(required)
-    assert "It holds for the whole model, as `compensate` uses it" in page
+    assert "It holds for the whole model, as <code>compensate</code> uses it" in page
     assert "transmission2_c1" not in page
     assert "Joint 2: 0." in page
     assert "Exported files hold the geometry of a separate fit" in page
