@@ -487,10 +487,6 @@ IN_TABLES |= {
     ),
     "commanded degrees": (commanded, "these are commanded joint values"),
     "worn circles of the instrument": (values(of_worn_circles), "angles of the instrument at the origin"),
-    "inverse poses without orientations": (
-        seen_from_the_reflector,
-        "inverse poses (the instrument in the reflector's frame)",
-    ),
     "a filter of the instrument": (
         values(lambda y: np.vstack([y[:1], 0.998 * y[1:] + 0.002 * y[:-1]])),
         "measured positions lag behind by 0.2 % of each move",

@@ -43,6 +43,7 @@ from tests.calibration.mistakes import (
     of_joint,
     reflectors_exchanged,
     rows_set,
+    seen_from_the_reflector,
     shifted,
     simulated_arm,
     tenths,
@@ -104,7 +105,6 @@ QUICK = {
         "z a column of RMS",
         "joint 2 frozen halfway",
         "joint 3 from the horizontal, and three joints reversed",
-        "inverse poses without orientations",
     ],
     "iiwa7": [
         "a column in centimetres",
@@ -281,6 +281,8 @@ def braced(change):
         ("iiwa7", joints(lambda q: q[..., ::-1]), "joints in the order q7, q6, q5, q4, q3, q2, q1"),
         ("irb120", values(lambda y: stations(y)), "from about row P55 on the points fit another base"),
         ("irb120", values(lambda y: np.where(SECOND, y[:, [1, 0, 2]], y)), "P2, P4, .* fit if read .* mirrored"),
+        ("ur5e", seen_from_the_reflector, "inverse poses"),
+        ("irb120", seen_from_the_reflector, "inverse poses"),  # a symmetric iiwa7 looks like one in reverse
         ("iiwa7", NEARER, "from row P4. on measured distances are 12.* mm too short"),
         ("iiwa7", braced(NEARER), "from row {P4.} on measured distances are 12.* mm too short"),
         ("ur5e", of_joint(0, lambda q: (q + np.pi / 2) % np.pi - np.pi / 2), "wrong values of joint 1"),
@@ -288,7 +290,7 @@ def braced(change):
     ],
     ids=[
         "rows in metres", "a sign in some rows", "mixed units", "joint 7 third", "joints in reverse", "three stations",
-        "two operators", "a new radius", "labels in braces",
+        "two operators", "inverse poses", "inverse poses, with offsets", "a new radius", "labels in braces",
         "half a turn", "tenths of a degree",
     ],
 )  # fmt: skip

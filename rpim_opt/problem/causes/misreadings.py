@@ -474,8 +474,17 @@ def _factors(points: Points) -> Iterator[Misreading]:
 
 
 def _orders(points: Points) -> Iterator[Misreading]:
-    """Yield all orders of up to six turning joints; of more, the reverse, and one moved, as ABB's seventh is third."""
+    """Yield inverse poses, and all orders of up to six turning joints; of more, the reverse or one moved."""
     robot = points.robot
+    mdh = robot.mdh
+    if points.turns is None and not points.lengths:  # else all of a pose is inverted
+        back = np.hstack([np.vstack([np.zeros(2), mdh[:0:-1, :2]]), mdh[::-1, 2:]])
+        types, joint_map = robot.joint_types[::-1], robot.joint_map[::-1, ::-1]
+        inverse = replace(robot, mdh=-back, joint_types=types, joint_map=joint_map)
+        what = "inverse poses (the instrument in the reflector's frame)"
+        yield Misreading(
+            what, "invert them, with their orientations", lambda of: replace(of, robot=inverse, q=-of.q[..., ::-1])
+        )
     joints = list(range(robot.dof))
     if len(set(robot.joint_dimensions)) > 1:
         return
@@ -520,14 +529,6 @@ def _other_robots(points: Points) -> Iterator[Misreading]:
     others = [(what, remedy, replace(robot, mdh=table)) for what, remedy, table in tables]
     ready = {name: read_robot(READY / f"{name}.toml") for name in robots()}
     others += [(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', of) for name, of in ready.items()]
-    if points.turns is None and not points.lengths:  # else all of a pose is inverted
-        back = np.hstack([np.vstack([np.zeros(2), links[:0:-1]]), mdh[::-1, 2:]])
-        types, joint_map = robot.joint_types[::-1], robot.joint_map[::-1, ::-1]
-        inverse = replace(robot, mdh=-back, joint_types=types, joint_map=joint_map)
-        what = "inverse poses (the instrument in the reflector's frame)"
-        yield Misreading(
-            what, "invert them, with their orientations", lambda of: replace(of, robot=inverse, q=-of.q[..., ::-1])
-        )
     for what, remedy, other in others:
         if (other.joint_types, other.dof) == (robot.joint_types, robot.dof):
             yield _with_robot(what, remedy, other)
