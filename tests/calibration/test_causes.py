@@ -281,6 +281,7 @@ def braced(change):
         ("iiwa7", joints(lambda q: q[..., ::-1]), "joints in the order q7, q6, q5, q4, q3, q2, q1"),
         ("irb120", values(lambda y: stations(y)), "from about row P55 on the points fit another base"),
         ("irb120", values(lambda y: np.where(SECOND, y[:, [1, 0, 2]], y)), "P2, P4, .* fit if read .* mirrored"),
+        ("ur5e", joints(lambda q: 0.9 * q), r"multiply all joint values by 1\.11"),
         ("ur5e", seen_from_the_reflector, "inverse poses"),
         ("irb120", seen_from_the_reflector, "inverse poses"),  # a symmetric iiwa7 looks like one in reverse
         ("iiwa7", NEARER, "from row P4. on measured distances are 12.* mm too short"),
@@ -290,7 +291,7 @@ def braced(change):
     ],
     ids=[
         "rows in metres", "a sign in some rows", "mixed units", "joint 7 third", "joints in reverse", "three stations",
-        "two operators", "inverse poses", "inverse poses, with offsets", "a new radius", "labels in braces",
+        "two operators", "the range of servos", "inverse poses", "inverse poses, with offsets", "a new radius", "labels in braces",
         "half a turn", "tenths of a degree",
     ],
 )  # fmt: skip

@@ -73,6 +73,7 @@ ANGLES = {
 LENGTHS_OF_ALL = "all measured lengths"
 MOST_TIMES, FACTORS, FINER = 3e3, 49, 3
 """Largest factor of a column that is sought, how many are tried, and how many of them are refined."""
+NEAR_ONE = np.array([0.8, 0.9, 1.1, 1.25])  # factors of all joints that are tried beside them, as of a servo's range
 ROWS_OF_THOUSANDS, THOUSANDTH, WIDER = 3, 0.3, 2.0
 """Rows that lost their thousands at least, what others reach [m], and the most that points extend over the flange's."""
 SLIPPED = ((1, "low", "up"), (-1, "high", "down"))
@@ -455,9 +456,9 @@ def _factors(points: Points) -> Iterator[Misreading]:
         return replace(points, **{name: getattr(points, name) * (1 + (factor - 1) * of)})
 
     few = points.evenly(FEW)
-    factors = np.geomspace(1 / MOST_TIMES, MOST_TIMES, FACTORS)
+    factors = np.append(np.geomspace(1 / MOST_TIMES, MOST_TIMES, FACTORS), NEAR_ONE)
     size = misfits([times(what, factor, few) for what in scaled for factor in factors.tolist()])
-    size = size.reshape(len(scaled), FACTORS)
+    size = size.reshape(len(scaled), -1)
     for k in np.argsort(size.min(axis=1))[:FINER]:
         what, factor = list(scaled)[k], float(factors[np.argmin(size[k])])
         ratio = factors[1] / factors[0]
