@@ -291,7 +291,8 @@ def braced(change):
     ],
     ids=[
         "rows in metres", "a sign in some rows", "mixed units", "joint 7 third", "joints in reverse", "three stations",
-        "two operators", "the range of servos", "inverse poses", "inverse poses, with offsets", "a new radius", "labels in braces",
+        "two operators", "the range of servos", "inverse poses", "inverse poses, with offsets", "a new radius",
+        "labels in braces",
         "half a turn", "tenths of a degree",
     ],
 )  # fmt: skip
@@ -834,6 +835,19 @@ def test_rows_that_all_scatter_alike_are_of_one_kind(name: str) -> None:
     assert alike == 0
     assert apart >= 7
     assert np.mean(right) > 0.9
+
+
+def test_poses_in_two_frames_are_told_from_poses_in_none() -> None:
+    """Their orientations contradict each other in any frame, and joint values "hardly explained" the positions."""
+    problem = ro.load("pose").problem
+    (block,) = problem.data.blocks
+    y, later = block.y.copy(), np.arange(len(block.y)) >= 18
+    turn = Rotation.from_euler("z", 90, degrees=True)
+    y[later, :3] = turn.apply(y[later, :3]) + np.array([0.3, -0.2, 0.1])
+    y[later, 3:] = (turn * Rotation.from_quat(y[later, 3:], scalar_first=True)).as_quat(scalar_first=True)
+    causes = likely_causes(ro.calibrate(problem.on(replace(problem.data, blocks=(replace(block, y=y),)))))
+    named = rf"from about row {problem.data.label[18]} on the points fit another base"
+    assert any(re.search(named, text) for text in causes), causes
 
 
 def test_the_travel_of_a_linear_joint_measures_the_scale_of_the_instrument_too() -> None:

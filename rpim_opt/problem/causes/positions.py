@@ -239,6 +239,8 @@ def other_places(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem) or lengths_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
+    if not points.by_camera:  # in two frames orientations contradict each other more than positions
+        points = replace(points, turns=None)
     parts, rest, exact = _stations(points)
     if exact:
         yield from computed_rows(problem.on(problem.data.take(points.row[parts[-1][0]])))
