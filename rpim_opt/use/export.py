@@ -360,8 +360,8 @@ def _write_urdf(
         tool, at_tip = arm.tool, None
         moved = 1e3 * np.linalg.norm(tool[:3] - own.tool[:3])
         notes.append(
-            f"URDF: {tip} moved by {moved:.3g} mm to the reflector, {placed(tool)} in the flange frame; other links on "
-            "the flange keep their poses from the file, which were not measured."
+            f"URDF: {tip} moved by {moved:.3g} mm to the reflector, {placed(tool)} in the flange frame, with the links "
+            "behind it; others on the flange keep their poses from the file, which were not measured."
         )
     elif of_tool:
         at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))

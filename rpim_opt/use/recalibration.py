@@ -39,6 +39,7 @@ from rpim_opt.problem.multi_robot import identifying_sessions
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import placed, same_place
 from rpim_opt.robot.kinematics import FRAME, frame_numbers
+from rpim_opt.robot.mdh import numbered
 from rpim_opt.robot.parameters import (
     Parameters,
     of_session,
@@ -744,7 +745,7 @@ def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -
     """
     free, data = problem.parameters.free, problem.sample().data
     place, measured = registration(free, data), {tool_prefix(m) for block in data.blocks for m in block.markers}
-    zeros = {problem.parameters.called(which, zero) for which, arm in problem.arms.items() for zero in arm.zeros}
+    zeros = _zeros(problem)
     causes = []
     wholes: dict[tuple[str, str], list[str]] = {}
     for name, frame, curve in zip(free.names, free.of_frames, free.of_curves, strict=True):
@@ -755,7 +756,7 @@ def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -
         if frame or curve:
             wholes.setdefault((name.rpartition("_")[0], kind), []).append(name)
         else:
-            causes.append(Cause(name, kind, (name,)))
+            causes.append(Cause(zeros.get(name, name), kind, (name,)))
     tools = [names for (name, kind), names in wholes.items() if kind == "frame" and f"{name}_" in measured]
     if len(tools) > 1:
         wholes["all reflectors", "frame"] = [name for names in tools for name in names]
@@ -764,9 +765,20 @@ def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -
     return causes + [Cause(*whole, tuple(names)) for whole, names in wholes.items()]
 
 
+def _zeros(problem: Source) -> dict[str, str]:
+    """Return the parameters that joint zeros are, and what they are called: with the joint's name, if it has one."""
+    called = {}
+    for which, arm in problem.arms.items():
+        joints = dict(enumerate(arm.joint_names))
+        for i, zero in enumerate(arm.zeros):
+            name = problem.parameters.called(which, zero)
+            called[name] = f"{name} ({joints[i]})" if joints.get(i) else name
+    return called
+
+
 def _of_arms(problem: Source, bent: bool) -> Iterator[Cause]:
     """Yield motors that move several joints; if bent, two joint zeros, and the numbers between two joints."""
-    names = problem.parameters.free.names
+    names, zeros = problem.parameters.free.names, _zeros(problem)
     for which, arm in problem.arms.items():
         for motor, column in enumerate(arm.joint_map.T):
             moved = [problem.parameters.called(which, arm.zeros[k]) for k in np.flatnonzero(column)]
@@ -774,12 +786,13 @@ def _of_arms(problem: Source, bent: bool) -> Iterator[Cause]:
                 yield Cause(f"motor {arm.joint(motor)} ({joined(moved)})", "joint offset", tuple(moved))
         free = [name for name in (problem.parameters.called(which, zero) for zero in arm.zeros) if name in names]
         for pair in [*combinations(free, 2)] * bent:  # two motors that were exchanged
-            yield Cause(joined(pair), "joint offsets", pair)
+            yield Cause(joined([zeros[name] for name in pair]), "joint offsets", pair)
         for i in range(1, len(arm.mdh) * bent):
             own = [f"theta{i}", f"d{i}", f"beta{i}", *(f"{kind}{i + 1}" for kind in ("alpha", "a", "theta", "d"))]
             members = [name for name in (problem.parameters.called(which, each) for each in own) if name in names]
             if len(members) > 1:
-                yield Cause(f"link between joints {i} and {i + 1}", "link", tuple(members))
+                ends = [numbered(k, arm.joint_names) for k in (i - 1, i)]
+                yield Cause(f"link between joints {joined(ends)}", "link", tuple(members))
 
 
 def readings(problem: Source, model: LinearModel) -> Iterator[tuple[Cause, np.ndarray]]:

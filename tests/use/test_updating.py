@@ -185,6 +185,18 @@ def test_a_link_that_was_bent_is_one_change() -> None:
     assert (drift.cause.name, drift.first) == ("link between joints 3 and 4", 0)
 
 
+def test_a_changed_joint_is_called_by_its_name_too() -> None:
+    """Behind a rail, ``theta4`` is the zero of A3."""
+    robot = happened(6, theta3=2e-3)
+    named = replace(robot.problem.robot, joint_names=("rail", "A1", "A2", "A3", "A4", "A5"))
+    problem = replace(robot.problem, robots=named)
+    first = ro.calibrate(problem.on(robot.before))
+    assert str(ro.use.update(first, robot.after).changes[0]) == "joint offset theta3 (A2)"
+    drift = ro.use.monitor(first, robot.after).drift
+    assert drift is not None
+    assert str(drift.moved).startswith("theta3 (A2) +0.11")
+
+
 @pytest.mark.parametrize("zeros", [("theta3", "theta4"), ("theta2", "theta5")])
 def test_two_motors_that_were_exchanged_at_once_are_both_named(zeros: tuple[str, str]) -> None:
     """Neighbours' zeros are two of the six numbers of a link; of others the larger one alone was named."""
