@@ -38,6 +38,11 @@ NEARLY = 0.9  # share of chi-squared explained beyond linearization, for instanc
 MOTION = 1.0  # prior standard deviation of a motion determined from the checks [m, rad]
 
 
+def _shown(cause: recalibration.Cause) -> dict[str, Any]:
+    """Return a cause as a document, without the posterior probability, which checks over time do not get."""
+    return {key: value for key, value in cause._asdict().items() if key != "probability"}
+
+
 class Drift(NamedTuple):
     """A change during checks."""
 
@@ -50,7 +55,7 @@ class Drift(NamedTuple):
     def content(self) -> dict[str, Any]:
         """Return it as a document [mm, deg]."""
         moved = self.moved and self.moved.content()
-        return {**self.cause._asdict(), "first": self.first, "steady": self.steady, "moved": moved}
+        return {**_shown(self.cause), "first": self.first, "steady": self.steady, "moved": moved}
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +110,7 @@ class Monitoring:
             "since": label.get(self.since),
             "limit": self.limit,
             "moved": self.drift and {**self.drift.content(), "label": label[self.drift.first]},
-            "wrong": [cause._asdict() for cause in self.wrong],
+            "wrong": [_shown(cause) for cause in self.wrong],
             "mistake": self.mistake,
             "registered": self.registered,
             "rows": records(self._columns()),

@@ -384,7 +384,9 @@ def _carried_on(record: Record, last: Earlier, source: str, opened: Array) -> Re
     return Record(
         title=f"{record.title.removesuffix(UPDATED)}{UPDATED}",
         source=BEFORE.join(filter(None, [source, first_source])),
-        excluded=dict.fromkeys(last.excluded, "far outside the prediction intervals of the previous calibration"),
+        excluded=dict.fromkeys(
+            last.excluded, "configuration far outside the prediction intervals of the earlier result"
+        ),
         simulated=record.simulated,
         noise_assumed=record.noise_assumed,
         details={k: t.removesuffix(OF_EARLIER) + OF_EARLIER * (k not in OF_ROBOT) for k, t in record.details.items()},
@@ -802,7 +804,7 @@ def readings(problem: Source, model: LinearModel) -> Iterator[tuple[Cause, np.nd
         for label, configuration in zip(part.data.label, part.data.configuration, strict=True):
             rows.setdefault(int(configuration), []).append(label)
     for number, labels in rows.items():
-        yield Cause(labels[0], "reading", tuple(labels)), np.flatnonzero(model.group == number)
+        yield Cause(" or ".join(labels), "reading", tuple(labels)), np.flatnonzero(model.group == number)
 
 
 def _weighed(

@@ -185,6 +185,20 @@ def test_a_link_that_was_bent_is_one_change() -> None:
     assert (drift.cause.name, drift.first) == ("link between joints 3 and 4", 0)
 
 
+def test_one_wrong_reading_of_several_of_a_configuration_is_not_said_of_the_first() -> None:
+    """All of them are left out, as they share the joints' noise."""
+    problem = simulated_arm("ur5e", count=50, markers=3)
+    order = np.argsort(problem.data.configuration, kind="stable")
+    first = ro.calibrate(problem.on(problem.data.take(order[:120])), ro.tikhonov, weight=1.0)
+    data = problem.data.take(order[120:])
+    blocks = list(data.blocks)
+    blocks[1] = replace(blocks[1], y=blocks[1].y + 2e-3 * (np.arange(len(blocks[1].y)) == 4)[:, None])
+    found = ro.use.update(first, replace(data, blocks=tuple(blocks)))
+    (cause,) = found.changes
+    assert str(cause) == "reading P45A or P45B or P45C"
+    assert {*found.result.record.excluded} == {"P45A", "P45B", "P45C"}
+
+
 def test_a_changed_joint_is_called_by_its_name_too() -> None:
     """Behind a rail, ``theta4`` is the zero of A3."""
     robot = happened(6, theta3=2e-3)
