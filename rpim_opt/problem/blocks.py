@@ -57,7 +57,7 @@ class PartitionedProblem(RobotModel):
     ``compute`` is like the built-in ``map``, in any order of execution: ``ThreadPoolExecutor().map``, or with a client
     of a Dask cluster ``lambda task, parts: client.gather(client.map(task, list(parts), pure=False))``. By default files
     of `partitions` are read and reduced on all cores, and a script's functions are called one after the other. Each
-    block has its own QR factor, so that the result is the same to the last digit whoever computes it.
+    block has its own QR factor, so that the result is the same to the last digit on any number of cores.
 
     InputError for no blocks, as for `CalibrationProblem`, for access to `data` of all blocks (they are not in memory),
     and while reading, for a block whose sessions the parameters lack (`starting_parameters`).

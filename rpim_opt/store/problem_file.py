@@ -471,10 +471,10 @@ def stated_prior(
         if table.earlier:
             with at_key("prior.from", path):
                 earlier = load(files[table.earlier])
-                found = earlier.problem.parameters.free
-                of_robot = np.array(found.names)[~found.of_frames].tolist()
-                missed = [name for name in of_robot if name not in parameters.free.names]
-                if missed := [name for name in missed if not any(fits(name, each) for each in table.without)]:
+                free = earlier.problem.parameters.free
+                of_robot = np.array(free.names)[~free.of_frames].tolist()
+                named = [*parameters.free.names, *table.without]
+                if missed := [name for name in of_robot if not any(fits(name, each) for each in named)]:
                     accepted = "them in `identify`, or in prior.without"
                     raise InputError("", f"parameters that are not identified here ({listed(missed)})", accepted)
                 prior &= Prior.from_result(earlier, table.inflate, table.without)

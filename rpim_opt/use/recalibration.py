@@ -51,7 +51,7 @@ from rpim_opt.store.result_file import content
 from rpim_opt.use.sessions import base_frame, registered_again
 
 FALSE_ALARM = 0.01  # false-alarm probability over all causes for a robot that did not change or drift
-MULTIPLES = (1.0, 3.0, 10.0, 30.0)  # of a deviation's prior width: possible sizes of a change, equally likely
+MULTIPLES = (1.0, 3.0, 10.0, 30.0)  # of a deviation's prior width: possible changes, equally likely
 UNCHANGED = 0.5  # prior probability of no change; the other half is divided among the kinds of causes in use
 OUTLIER_WIDTH = 10.0  # standard deviations of an outlier, times `MULTIPLES`
 UNOBSERVABLE = 1e-9  # relative eigenvalue below which readings do not observe a direction of a change
@@ -763,7 +763,7 @@ def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -
     if len(tools) > 1:
         wholes["all reflectors", "frame"] = [name for names in tools for name in names]
     known = {*free.names} - {*reset}
-    causes += [cause for cause in _of_arms(problem, bent) if {*cause.members} <= known]
+    causes += [cause for cause in _of_arms(problem, zeros, bent) if {*cause.members} <= known]
     return causes + [Cause(*whole, tuple(names)) for whole, names in wholes.items()]
 
 
@@ -778,17 +778,16 @@ def _zeros(problem: Source) -> dict[str, str]:
     return called
 
 
-def _of_arms(problem: Source, bent: bool) -> Iterator[Cause]:
+def _of_arms(problem: Source, zeros: Mapping[str, str], bent: bool) -> Iterator[Cause]:
     """Yield motors that move several joints; if bent, two joint zeros, and the numbers between two joints."""
-    names, zeros = problem.parameters.free.names, _zeros(problem)
+    names = problem.parameters.free.names
+    for pair in [*combinations([name for name in zeros if name in names], 2)] * bent:  # two motors that were exchanged
+        yield Cause(joined([zeros[name] for name in pair]), "joint offsets", pair)
     for which, arm in problem.arms.items():
         for motor, column in enumerate(arm.joint_map.T):
             moved = [problem.parameters.called(which, arm.zeros[k]) for k in np.flatnonzero(column)]
             if len(moved) > 1:
                 yield Cause(f"motor {arm.joint(motor)} ({joined(moved)})", "joint offset", tuple(moved))
-        free = [name for name in (problem.parameters.called(which, zero) for zero in arm.zeros) if name in names]
-        for pair in [*combinations(free, 2)] * bent:  # two motors that were exchanged
-            yield Cause(joined([zeros[name] for name in pair]), "joint offsets", pair)
         for i in range(1, len(arm.mdh) * bent):
             own = [f"theta{i}", f"d{i}", f"beta{i}", *(f"{kind}{i + 1}" for kind in ("alpha", "a", "theta", "d"))]
             members = [name for name in (problem.parameters.called(which, each) for each in own) if name in names]

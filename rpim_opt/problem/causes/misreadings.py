@@ -616,12 +616,12 @@ def _mapping_behind(points: Points) -> Better | None:
         behind.append(_scaled(f"measured lengths {LENGTHS[factor][0]}", LENGTHS[factor][1], factor))
     stated = robot.joint_map
     apart = stated - np.eye(*stated.shape) * stated
-    maps = {"the coupling of the robot file with the opposite sign": [stated - 2 * apart]} if apart.any() else {}
+    what, maps = "the coupling of the robot file with the opposite sign", [stated - 2 * apart] * bool(apart.any())
     if not maps and robot.leading[1:3] == (1, 2):  # FANUC's third joint counts from the horizontal
         from_horizontal = np.outer(np.eye(robot.dof)[2], np.eye(robot.dof)[1])
         what = f"joint {robot.joint(2)} coupled to joint {robot.joint(1)}"
-        maps[what] = [stated + from_horizontal, stated - from_horizontal]
-    behind += [_with_robot(what, "", replace(robot, joint_map=each)) for what, of in maps.items() for each in of]
+        maps = [stated + from_horizontal, stated - from_horizontal]
+    behind += [_with_robot(what, "", replace(robot, joint_map=each)) for each in maps]
     for each in behind:
         there = each.change(points)
         mapping = search(there)

@@ -593,8 +593,8 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
     """Report one or two joints that explain residuals at x (n,) if each is at either of two positions in every row.
 
     They leave less than a part ``most`` of the residuals, two joints at most half of what one does, with parameters
-    fitted and their prior. Random errors leave 60 %, since signs are fitted but not sizes, and much less with fewer
-    than three equations per parameter.
+    fitted and their prior. Random errors leave 60 %, since signs are fitted but not magnitudes, and much less with
+    fewer than three equations per parameter.
     """
     model, free = problem.with_repeatability(None).linearize(x), problem.parameters.free
     if len(model.b) < 3 * len(x):
