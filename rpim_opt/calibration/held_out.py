@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 from scipy.special import fdtrc
 
 from rpim_opt.basics.arrays import Array
@@ -106,7 +106,7 @@ def registered(result: Calibration, data: Dataset, mine: np.ndarray | None = Non
     left = np.linalg.norm(predicted - transformed(first, measured), axis=1)
     kept = left <= GROSS * np.median(left)
     motion = register(measured[kept], predicted[kept])
-    turn = Rotation.from_matrix(motion[:3, :3])
+    turn = scipy.spatial.transform.Rotation.from_matrix(motion[:3, :3])
     blocks = []
     for block in data.blocks:
         if block.measurement.name in (position.name, pose.name):

@@ -95,11 +95,11 @@ class _Parameters:
 
     def start(self, name: str) -> Symbol:
         """Return the nominal value, zero where there is none of this name."""
-        return self.nominal[self._start[name]] if name in self._start else ca.SX(0)
+        return self.nominal[self._start[name]] if name in self._start else 0.0
 
     def deviation(self, name: str) -> Symbol:
         """Return the deviation, zero where it is not identified."""
-        return self.x[self._free[name]] if name in self._free else ca.SX(0)
+        return self.x[self._free[name]] if name in self._free else 0.0
 
     def value(self, name: str) -> Symbol:
         """Return the sum of both."""

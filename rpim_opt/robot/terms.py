@@ -247,7 +247,7 @@ def term_motion(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.
     """Return the motion of a term, (1, 1) or (6, 1); None if its parameters are all zero."""
     sizes = [value(name) for name in term.names(joint.number)]
     # building an effect may need the whole chain: skipped without its parameter
-    if sizes and all(ca.SX(size).is_zero() for size in sizes):
+    if sizes and all(size == 0 if isinstance(size, float) else ca.SX(size).is_zero() for size in sizes):
         return None
     try:
         moves = term.moves(joint, *sizes)

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, pick
@@ -449,7 +449,7 @@ def _of_controller(result: Calibration, marker: str | None, arm: RobotSetup) -> 
     texts = []
     for T in (numeric_frame(arm.tool), numeric_frame(arm.base) @ numeric_link(theta=half)):
         lengths = (f"{name} {1e3 * value:z.3f}" for name, value in zip("XYZ", T[:3, 3], strict=True))
-        vector = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+        vector = scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).as_rotvec()
         angles = (f"{name} {value:z.5f}" for name, value in zip(("RX", "RY", "RZ"), vector, strict=True))
         texts.append(f"{' '.join(lengths)} mm, {' '.join(angles)} rad")
     return (

@@ -8,7 +8,7 @@ from functools import wraps
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
@@ -213,7 +213,7 @@ def least_between(score: Score, weights: Array, best: int, ratio: float = 1 + 1e
     """
     low, high = np.log(weights[[best - 1, best + 1]])
     with np.errstate(invalid="ignore"):  # scores are NaN where the solver failed
-        minimum: Any = minimize_scalar(
+        minimum: Any = scipy.optimize.minimize_scalar(
             lambda t: score(np.exp([t]))[0], bounds=(low, high), method="bounded", options={"xatol": np.log(ratio)}
         )
     return float(np.exp(minimum.x)), float(minimum.fun)

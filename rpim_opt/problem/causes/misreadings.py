@@ -9,8 +9,7 @@ from itertools import combinations, pairwise, permutations, product
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
+import scipy
 from scipy.special import fdtr
 
 from rpim_opt.basics.arrays import Array
@@ -134,7 +133,7 @@ def pose_misfit(robot: Robot, data: Dataset, tool: Array | None = None) -> float
     else:
         nominal = flange @ numeric_frame(tool)
     error = np.swapaxes(measured[:, :3, :3], 1, 2) @ nominal[:, :3, :3]
-    return float(np.sqrt(np.mean(Rotation.from_matrix(error).magnitude() ** 2)))
+    return float(np.sqrt(np.mean(scipy.spatial.transform.Rotation.from_matrix(error).magnitude() ** 2)))
 
 
 # What a table may be mistaken for
@@ -317,18 +316,19 @@ def _scaled(what: str, remedy: str, factors: Array | float) -> Misreading:
 
 def _of_poses() -> Iterator[Misreading]:
     """Yield readings with other orientations."""
+    Rotation = scipy.spatial.transform.Rotation
 
-    def turned(what: str, remedy: str, change: Callable[[Rotation], Rotation]) -> Misreading:
+    def turned(what: str, remedy: str, change: Callable[[Any], Any]) -> Misreading:
         def turns(points: Points) -> Points:
             return replace(points, turns=change(Rotation.from_matrix(points.turns)).as_matrix())
 
         return Misreading(what, remedy, turns)
 
-    def euler(axes: str, columns: Sequence[int] = (0, 1, 2), factor: Any = 1.0) -> Callable[[Rotation], Rotation]:
+    def euler(axes: str, columns: Sequence[int] = (0, 1, 2), factor: Any = 1.0) -> Callable[[Any], Any]:
         # angles rx, ry, rz, taken for roll, pitch, yaw, are about other axes or in another unit
         return lambda R: Rotation.from_euler(axes, (factor * R.as_euler("xyz"))[:, list(columns)])
 
-    def reordered(order: list[int]) -> Callable[[Rotation], Rotation]:
+    def reordered(order: list[int]) -> Callable[[Any], Any]:
         return lambda R: Rotation.from_quat(R.as_quat()[:, order])
 
     yield turned("inverted orientations (of the instrument in the tool's frame)", "invert the rotations", Rotation.inv)
@@ -379,7 +379,7 @@ def _in_one_frame(points: Points) -> Points:
     flange = fit_points(replace(points, turns=None)).base @ forward_kinematics(points.robot, points.q)
 
     def turns(R: Array) -> Array:
-        return Rotation.from_matrix(R[1:] @ np.swapaxes(R[:-1], 1, 2)).as_rotvec()
+        return scipy.spatial.transform.Rotation.from_matrix(R[1:] @ np.swapaxes(R[:-1], 1, 2)).as_rotvec()
 
     Q = proper(np.einsum("ni,nj->ij", turns(flange[:, :3, :3]), turns(points.turns)))
     return replace(points, turns=Q @ points.turns)
@@ -426,7 +426,7 @@ def _apart(points: Points) -> Iterator[Misreading]:
     place = np.arange(len(points.row))
     if len(place) < 2 * FEWEST:
         return
-    path = CubicSpline(place, points.q)
+    path = scipy.interpolate.CubicSpline(place, points.q)
 
     def at(shift: float, points: Points) -> Points:
         return replace(points, q=path(place + shift))
@@ -680,8 +680,9 @@ def _best(points: Points, readings: list[Misreading]) -> tuple[list[Misreading],
     least = float(size.min(initial=np.inf))
     if not np.isfinite(least):
         return [], float("inf")
-    near = [readings[i] for i in np.argsort(size) if size[i] <= 2 * least][:8]
-    whole = _tried(points, near, len(points.row))
+    order = [i for i in np.argsort(size) if size[i] <= 2 * least][:8]
+    near = [readings[i] for i in order]
+    whole = size[order] if len(points.row) <= FEW else _tried(points, near, len(points.row))
     k = int(np.argmin(whole))
     same = [each for each, left in zip(near, whole, strict=True) if left <= SAME * whole[k]]
     return [near[k]._replace(others=tuple(each for each in same if each is not near[k])[:3])], float(whole[k])

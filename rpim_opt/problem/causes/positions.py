@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 from scipy.special import bdtrc
 
 from rpim_opt.basics.arrays import Array, rms
@@ -66,7 +66,8 @@ def computed_columns(problem: CalibrationProblem) -> Iterator[str]:
     T = forward_kinematics(points.robot, points.q)
     if points.turns is not None:
         angles = [
-            Rotation.from_matrix(R[1:] @ R[:-1].transpose(0, 2, 1)).magnitude() for R in (points.turns, T[:, :3, :3])
+            scipy.spatial.transform.Rotation.from_matrix(R[1:] @ R[:-1].transpose(0, 2, 1)).magnitude()
+            for R in (points.turns, T[:, :3, :3])
         ]
         apart = rms(angles[0] - angles[1])
         if apart < EXACT_TURN:
@@ -239,7 +240,9 @@ def other_places(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem) or lengths_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
-    if not points.by_camera:  # in two frames orientations contradict each other more than positions
+    if (
+        points.turns is not None and not points.by_camera
+    ):  # in two frames orientations contradict each other more than positions
         points = replace(points, turns=None)
     parts, rest, exact = _stations(points)
     if exact:
@@ -278,7 +281,7 @@ def _stations(points: Points) -> tuple[list[tuple[np.ndarray, Fit]], np.ndarray,
     parts: list[tuple[np.ndarray, Fit]] = []
     rest = np.arange(len(points.row))
     while whole >= FAR_MOVED * points.extent and len(rest) >= FEWEST:
-        own, fit = agreeing(points.take(rest))
+        own, fit = agreeing(points.take(rest) if parts else points)
         part = rest[own]
         if len(part) < FEWEST or rms(fit.error[own]) >= min(BETTER * whole, WRONG * points.take(part).extent):
             break

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
 from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.exceptions import InputError
@@ -452,6 +452,6 @@ def ridge_deviations(alone: Source, steps: int = 200, prior: tuple[Array, Array]
         return np.vstack([qr_factor(z)[:, :-1], L])
 
     options: Any = {"jac": slopes, "x_scale": "jac", "xtol": 1e-11, "ftol": 1e-15, "gtol": 1e-15}
-    z = least_squares(residual, start, method="lm", max_nfev=steps, **options).x
+    z = scipy.optimize.least_squares(residual, start, method="lm", max_nfev=steps, **options).x
     z = z - np.linalg.lstsq(slopes(z), residual(z), rcond=None)[0]  # where the sum of squares no longer changes
     return np.asarray(scale * z, dtype=float)

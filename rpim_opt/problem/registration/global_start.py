@@ -11,11 +11,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
+from itertools import compress, product
 from typing import Any
 
 import numpy as np
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import joined, three_digits
@@ -37,7 +37,7 @@ from rpim_opt.problem.registration.points import (
     stacked,
 )
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame
-from rpim_opt.robot.mdh import Robot, numbered
+from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, Robot, numbered
 from rpim_opt.robot.parameters import tool_prefix
 
 ACCEPTED = 0.02  # a mapping may leave this part of the extent: an arm's geometric errors are not fitted with it
@@ -391,7 +391,7 @@ class _Mappings:
             return bool(near) or _apart(there[i], there[k], self.points.lengths) <= same
 
         links = [[alike(i, k) for k in there] for i in there]
-        number = connected_components(np.array(links))[1].tolist()
+        number = scipy.sparse.csgraph.connected_components(np.array(links))[1].tolist()
         return [[i for i, own in zip(there, number, strict=True) if own == k] for k in dict.fromkeys(number)]
 
     def same(self, robot: Sequence[int]) -> tuple[Alternative, ...]:
@@ -492,13 +492,13 @@ def _behind_a_mirror(points: Points, largest: float) -> list[str]:
 
 def _of_other_sign(points: Points, largest: float) -> tuple[str, ...]:
     """Return the lengths of the DH table one of which, with the other sign, explains points to ``largest`` [m]."""
-    names = []
-    for joint, column in zip(*np.nonzero(points.robot.mdh[:, [1, 3]]), strict=True):
-        mdh = points.robot.mdh.copy()
-        mdh[joint, (1, 3)[column]] *= -1
-        if _explain([replace(points, robot=replace(points.robot, mdh=mdh))], largest)[0]:
-            names.append(f"{'ad'[column]}{joint + 1}")
-    return tuple(names)
+    others = {}
+    for i, k in np.argwhere(points.robot.mdh):
+        if MDH_DIMENSION[MDH[k]] == "length":
+            others[f"{MDH[k]}{i + 1}"] = mdh = points.robot.mdh.copy()
+            mdh[i, k] *= -1
+    tries = [replace(points, robot=replace(points.robot, mdh=mdh)) for mdh in others.values()]
+    return tuple(compress(others, _explain(tries, largest) if tries else ()))
 
 
 def _explain(tries: Sequence[Points], largest: float) -> np.ndarray:

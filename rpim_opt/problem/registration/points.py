@@ -30,6 +30,7 @@ FULL_WEIGHT = 3.0
 """Rows farther off than so many medians count less, in proportion: gross errors do not decide what a table means."""
 UNEXPLAINED = 0.01
 """Nominal errors beyond this part of the points' extent (0.3 % of a robot's reach) are not those of a robot."""
+AT_ONCE, STALLED = 10, 5  # steps of all candidates together (an even number), and those without progress that end one
 LARGEST_BATCH = 4_000_000  # entries of the Jacobians in memory at once
 DRAWS, BEST_DRAWS, LEAST_SHARE = 400, 20, 1 / 3
 """Few rows that are fitted to find those that agree, how many of these are refined, and the share that has to agree."""
@@ -152,9 +153,10 @@ class Fit(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """B sets of N points to be fitted at once."""
+    """B sets of N points to be fitted at once, of robots with equal types of joints."""
 
-    robot: Robot
+    joint_types: tuple[str, ...]
+    mdh: Array  # (B, dof, 5)
     q: Array  # (B, NK, dof) joint values of the model; of poses one for their four points
     y: Array  # (B, N, 3) positions or (B, N, 1) lengths [m]
     marker: np.ndarray  # (B, NK) reflectors
@@ -162,16 +164,17 @@ class Candidates(NamedTuple):
     tools: Array  # (B, M, 3) start values of reflectors
     stated: Array  # (M, 3) their stated places
     spread: Array  # (M,) standard deviations of these [m]
+    damping: Array  # (B,) of the first step
 
     @classmethod
     def of(cls, tries: Sequence[Points]) -> Candidates:
-        """Return candidates of one robot with equal numbers of points, and stated joint zeros and reflectors.
+        """Return candidates with equal numbers of points, and stated joint zeros and reflectors.
 
         Tips of a pose's axes are points of additional reflectors.
         """
-        q, y, marker, tools = (
-            np.stack([getattr(points, name) for points in tries]) for name in ("q", "y", "marker", "tools")
-        )
+        y, marker, tools = (np.stack([getattr(points, name) for points in tries]) for name in ("y", "marker", "tools"))
+        mdh = np.stack([points.robot.mdh for points in tries])
+        q = np.stack([points.q @ points.robot.joint_map.T for points in tries])
         B, M, _ = tools.shape
         q, marker = q.reshape(B, -1, q.shape[-1]), marker.reshape(B, -1)
         spread = np.full(M, TOOL_ERROR)
@@ -182,12 +185,13 @@ class Candidates(NamedTuple):
             y = np.concatenate([y[:, :, None], y[:, :, None] + axes], axis=2).reshape(B, -1, 3)
             marker = (4 * marker[:, :, None] + np.arange(4)).reshape(B, -1)
             spread = np.tile([TOOL_ERROR, *3 * [10 * TOOL_ERROR]], M)
-        robot = tries[0].robot
-        return cls(robot, q @ robot.joint_map.T, y, marker, np.zeros((B, len(robot.mdh))), tools, tools[0], spread)
+        zero = np.zeros(mdh.shape[:2])
+        damping = np.full(B, 1e-2)
+        return cls(tries[0].robot.joint_types, mdh, q, y, marker, zero, tools, tools[0], spread, damping)
 
     def take(self, index: np.ndarray) -> Candidates:
         """Return the candidates at ``index``."""
-        taken = {name: getattr(self, name)[index] for name in ("q", "y", "marker", "zero", "tools")}
+        taken = {name: getattr(self, name)[index] for name in ("mdh", "q", "y", "marker", "zero", "tools", "damping")}
         return self._replace(**taken)
 
 
@@ -287,7 +291,7 @@ def misfit(points: Points) -> float:
 def misfits(tries: Sequence[Points], zeros: bool = True) -> Array:
     """Return the same (B,) of many interpretations of a table, joint zeros fitted by default."""
     errors = np.full(len(tries), np.inf)
-    kinds = [(id(points.robot), len(points.row)) for points in tries]
+    kinds = [(points.robot.joint_types, len(points.row)) for points in tries]
     for kind in dict.fromkeys(kinds):
         some = [i for i, each in enumerate(kinds) if each == kind]
         alike = [tries[i] for i in some]
@@ -315,7 +319,7 @@ def _registered(points: Array, y: Array, weights: Array) -> tuple[Array, Array, 
     share = weights / weights.sum(axis=1, keepdims=True)
     away = points - (points * share).sum(axis=-1, keepdims=True)
     target = y - (y * share).sum(axis=-1, keepdims=True)
-    base = proper(np.einsum("ibn,jbn->bij", weights * away, target))
+    base = proper((weights * away).transpose(1, 0, 2) @ target.transpose(1, 2, 0))
     return base, np.zeros(len(base)), away, away - np.einsum("bij,jbn->ibn", base, target)
 
 
@@ -355,8 +359,22 @@ def _anchored(points: Array, y: Array, weights: Array) -> tuple[Array, Array, Ar
 
 
 def _fitted(candidates: Candidates, steps: int, zeros: bool, robust: bool, noise: float) -> Fit:
+    """Return the fits after the first steps, and of candidates that these did not end, after further ones."""
+    fit, damping, ended = _some_steps(candidates, min(steps, AT_ONCE), zeros, robust, noise)
+    going = np.flatnonzero(~ended)
+    if len(going) and steps > AT_ONCE:
+        rest = candidates.take(going)._replace(zero=fit.zero[going], tools=fit.tools[going], damping=damping[going])
+        for whole, some in zip(fit, _fitted(rest, steps - AT_ONCE, zeros, robust, noise), strict=True):
+            whole[going] = some
+    return fit
+
+
+def _some_steps(
+    candidates: Candidates, steps: int, zeros: bool, robust: bool, noise: float
+) -> tuple[Fit, Array, np.ndarray]:
+    """Return the fits, the damping (B,) of the next step, and which have not improved for `STALLED` steps."""
     B, N, coordinates = candidates.y.shape
-    damping = np.full(B, 1e-2)
+    damping = candidates.damping
     weights = np.ones((B, N))
     pull = (noise / candidates.spread) ** 2
     y = np.moveaxis(candidates.y, -1, 0)
@@ -375,7 +393,7 @@ def _fitted(candidates: Candidates, steps: int, zeros: bool, robust: bool, noise
     zero, tools = candidates.zero, candidates.tools
     size = tools[0].size
     state = at(zero, tools)
-    stalled = 0
+    stalled = np.zeros(B, dtype=int)
     for k in range(steps):
         if robust and k % 2 == 0:
             error = np.linalg.norm(state.residual, axis=0)
@@ -393,45 +411,48 @@ def _fitted(candidates: Candidates, steps: int, zeros: bool, robust: bool, noise
         tools = np.where(better[:, None, None], other_tools, tools)
         masks = (better[:, None, None], better, better, *6 * [better[:, None]])
         state = candidate if better.all() else _State(*map(np.where, masks, candidate, state))
-        stalled = 0 if fell.any() else stalled + 1
-        if stalled == 5:
+        stalled = np.where(fell, 0, stalled + 1)
+        if (stalled >= STALLED).all():
             break
+    ended = stalled >= STALLED
     if coordinates == 1:
         modelled = candidates.y + np.moveaxis(state.residual, 0, -1)
         base = rigid(state.base, (state.away[..., 0] - state.points[..., 0]).T)
-        return Fit(modelled, np.abs(state.residual[0]), state.cost, base, tools, zero, state.offset)
+        return Fit(modelled, np.abs(state.residual[0]), state.cost, base, tools, zero, state.offset), damping, ended
     turn = np.swapaxes(state.base, 1, 2)
     seen = np.einsum("bij,jbn->bni", turn, state.points)
     weight = weights / weights.sum(axis=1, keepdims=True)
     base = rigid(turn, np.einsum("bn,bni->bi", weight, candidates.y - seen))
     modelled = seen + base[:, None, :3, 3]
     error = np.linalg.norm(candidates.y - modelled, axis=2)
-    return Fit(modelled, error, state.cost, base, tools, zero, state.offset)
+    return Fit(modelled, error, state.cost, base, tools, zero, state.offset), damping, ended
 
 
 def _flange(candidates: Candidates, zero: Array) -> list[Array]:
     """Return rotation columns (3, 3, B, N) and origins (3, B, N) of flanges, axes and origins (dof, 3, B, N)."""
-    robot, q = candidates.robot, candidates.q + zero[:, None]
+    q = candidates.q + zero[:, None]
     B, N, dof = q.shape
     x, y, z = (np.broadcast_to(e[:, None, None], (3, B, N)) for e in np.eye(3))
     p = np.zeros((3, B, N))
     axes = np.empty((dof, 3, B, N))
     origins = np.empty((dof, 3, B, N))
-    for j, (alpha, a, theta, d, beta) in enumerate(robot.mdh):
+    for j, (alpha, a, theta, d, beta) in enumerate(candidates.mdh.transpose(1, 2, 0)[..., None]):
         c, s = np.cos(alpha), np.sin(alpha)
         y, z = c * y + s * z, c * z - s * y
         p = p + a * x
         axes[j] = z
         origins[j] = p
-        turning = robot.joint_types[j] == "revolute"
+        turning = candidates.joint_types[j] == "revolute"
         angle = theta + turning * q[:, :, j]
         c, s = np.cos(angle), np.sin(angle)
         x, y = c * x + s * y, c * y - s * x
         p = p + (d + (not turning) * q[:, :, j]) * z
-        if beta:
+        if beta.any():
             c, s = np.cos(beta), np.sin(beta)
             x, z = c * x - s * z, c * z + s * x
-    return [each.repeat(candidates.marker.shape[1] // N, axis=-1) for each in (np.stack([x, y, z]), p, axes, origins)]
+    every = candidates.marker.shape[1] // N
+    found = [np.stack([x, y, z]), p, axes, origins]
+    return found if every == 1 else [each.repeat(every, axis=-1) for each in found]
 
 
 def _step(
@@ -449,7 +470,7 @@ def _step(
             J[:, 3 * m + k] = np.moveaxis(state.turn[k] * seen, 0, 1)
     for j in range(dof):
         slope = state.axes[j]
-        if candidates.robot.joint_types[j] == "revolute":
+        if candidates.joint_types[j] == "revolute":
             arm = state.points - state.origins[j]  # `numpy.cross` takes three times as long
             slope = np.stack([slope[i - 2] * arm[i - 1] - slope[i - 1] * arm[i - 2] for i in range(3)])
         J[:, 3 * M + j] = np.moveaxis(slope, 0, 1)
@@ -464,9 +485,10 @@ def _step(
             J = np.concatenate([J, np.moveaxis(unit, 0, 1)[:, :, None]], axis=1)
     if candidates.marker.shape[1] == N:
         share = (weights / weights.sum(axis=1, keepdims=True))[:, None, None]
-        J -= (J * share).sum(axis=-1, keepdims=True)
+        J -= np.einsum("bcin,bin->bci", J, np.broadcast_to(share[:, 0], (B, *J.shape[2:])))[..., None]
     root = np.sqrt(weights)[:, None, None]
-    A = (J * root).reshape(B, J.shape[1], -1)
+    J *= root
+    A = J.reshape(B, J.shape[1], -1)
     r = (np.moveaxis(state.residual, 0, 1) * root[:, 0]).reshape(B, -1, 1)
     H = A @ np.swapaxes(A, 1, 2)
     g = (A @ r)[..., 0]
