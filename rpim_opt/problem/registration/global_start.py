@@ -45,7 +45,7 @@ EXPLAINED = 3.0
 """A mapping is taken if it leaves less than a third of what the nominal one leaves with zeros fitted near it."""
 NEAR_ZERO = 0.2  # joint zeros up to this [rad] are left to the calibration, as deviations of theta
 QUARTER = np.pi / 2
-SHORT, LONG = 14, 45  # steps of all starts of a round, and of the best quarter
+SHORT, LONG = 10, 45  # steps of all starts of a round, and of the best quarter
 ROUNDS, HITS = 4, 5  # rounds at most, and starts that have to end in the best optimum
 FEW = 40  # rows of a search; the best candidates are fitted to more
 LEAST_NOISE = 5e-5  # floor of the error of a point [m]: what is nearer is rounding
