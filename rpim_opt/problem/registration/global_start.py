@@ -468,7 +468,7 @@ def _judged(
         apart = _apart(each, there[first[0]], points.lengths)
         deciding = elsewhere[int(np.argmax(far))]
         others.append(Alternative(found.sign[k], found.zeros[k], apart, deciding, mirrors(plainest[k], first)))
-    nominal = float(rms(fit_arms(Candidates.of([points]), SHORT, robust=True))[0])
+    nominal = float(rms(fit_arms(Candidates.of([points]), LONG, robust=True))[0])
     left = float(rms(fits)[i])
     behind = _behind_a_mirror(points, MIRRORED * left)
     if changes < 2:  # fewer changes than a mirror and a joint
