@@ -779,6 +779,7 @@ def _against(limit: float | None, name: str, value: float) -> tuple[list[str], b
 
 def main() -> None:
     """Run the command line; an error that a user can correct is one sentence, not a traceback."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `one_blas_thread`, before any BLAS is loaded
     with console.output_errors():
         try:
             code = app(standalone_mode=False)

@@ -8,6 +8,7 @@ from typing import Any
 
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import html_table
+from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.calibration import words
 from rpim_opt.calibration.outcome import Iteration, Outcome, Prediction
 from rpim_opt.calibration.verdict import Verdict, judge, likely_causes, mistakes
@@ -69,11 +70,13 @@ class Calibration(Outcome):
     """
 
     @cached_property
+    @one_blas_thread
     def verdict(self) -> Verdict:
         """Whether this robot is delivered, and the reasons if not; exports, exit codes and reports follow it."""
         return judge(self, mistakes(self.causes))
 
     @cached_property
+    @one_blas_thread
     def causes(self) -> tuple[str, ...]:
         """Likely causes of a poor fit, one sentence each (`likely_causes`)."""
         return tuple(likely_causes(self))

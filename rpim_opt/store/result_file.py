@@ -17,6 +17,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import read_json, write_json
+from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.hyperparameters import Learned
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration.certificate import Certificate
@@ -63,6 +64,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 """Functions of a formulation that a file names; makers of functions are named in a list with their arguments."""
 
 
+@one_blas_thread
 def save_result(result: Calibration, path: str | Path) -> None:
     """Write a calibration to one JSON file, or ``result.json`` in a folder, which `load_result` reads.
 

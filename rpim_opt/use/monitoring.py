@@ -15,6 +15,7 @@ from rpim_opt.basics.arrays import Array, finite_numbers, rms
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import joined, listed, three_digits
+from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import noise_covariances
 from rpim_opt.calibration.result import Calibration
@@ -179,6 +180,7 @@ class Monitoring:
         return {name: cells for name, cells in named.items() if cells}
 
 
+@one_blas_thread
 def monitor(
     result: Calibration, data: Dataset, when: Array | None = None, times: tuple[str, ...] = (), register: bool = False
 ) -> Monitoring:

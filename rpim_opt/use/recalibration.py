@@ -14,6 +14,7 @@ import numpy as np
 from rpim_opt.basics.arrays import TINY, Array, rms, statistics
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import counted, joined, table, three_digits
+from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display, printed
 from rpim_opt.bayes.model_selection import deviations, named
 from rpim_opt.bayes.prior import Prior
@@ -217,6 +218,7 @@ class Update:
         return "\n".join([*lines, *refused, "", table(head, rows[:SHOWN]), "", self.result.message])
 
 
+@one_blas_thread
 def update(
     result: Calibration,
     data: Dataset,
