@@ -35,7 +35,9 @@ CELLS = 150  # steps of a sum's range in the Markov chain of its distribution
 HIGHEST_LIMIT = 50.0
 SET_UP_ANEW = 3.0  # factor of errors without over with registration of every set-up, from which set-ups have moved
 DAY = 86400.0  # seconds
-NEARLY = 0.9  # share of chi-squared explained beyond linearization, for instance by another place of the base
+FAR, NEARLY = 100.0, 0.9
+"""Standard deviations of a motion that may be beyond linearization, and the part of chi-squared that it explains."""
+LINK = -10.0  # added to ln of a link's prior probability: frames that it nearly explains move more often
 MOTION = 1.0  # prior standard deviation of a motion determined from the checks [m, rad]
 
 
@@ -154,7 +156,7 @@ class Monitoring:
             if self.drift.others:
                 lines.append(f"A change of {joined(self.drift.others)} explains the checks as well: measure more.")
         elif self.drifts and not self.wrong:
-            lines.append("No single parameter or frame explains the deviation.")
+            lines.append("No single parameter or frame explains the deviation. Recalibrate by `update`.")
         worst = int(np.argmax(self.sigmas / self.allowed))
         lines.append(
             f"Largest residual: {self._named(worst)}, {self.sigmas[worst]:.1f} standard deviations of a new reading "
@@ -364,7 +366,8 @@ class _Explanations:
         readings = list(recalibration.readings(problem, self.model))
         self.equations = {cause.members: rows for cause, rows in readings}
         causes = [*recalibration.candidates(framed, bent=bent), *(cause for cause, _ in readings)]
-        self.priors = dict(zip(causes, recalibration.log_priors(causes).tolist(), strict=True))
+        rarer = [LINK * (cause.kind == "link") for cause in causes]
+        self.priors = dict(zip(causes, (recalibration.log_priors(causes) + rarer).tolist(), strict=True))
 
     def columns(self, drift: Drift) -> Array:
         """Return the effect (m, c) of a change: from its first check on, or linear over the checks if it is steady."""
@@ -434,7 +437,8 @@ def _drift(
     found = [_explained(explanations, level, True)]
     if not found[-1].enough:  # many wrong readings may be a change
         found.append(_explained(explanations, level, False))
-    if not found[-1].enough:  # and several changes one of a link
+    drift = found[-1].drift
+    if not found[-1].enough or (drift and len(drift.cause.members) > 1):  # and several changes one of a link
         found.append(_explained(_Explanations(result, problem, own, True), level, False))
     best = max(found, key=lambda each: (each.log, each.drift is not None))
     return best.drift, best.wrong
@@ -463,6 +467,11 @@ def _explained(explanations: _Explanations, level: float, single: bool) -> _Expl
         more, best = _likeliest(found)
         if best.cause.p_value * len(found) >= level:
             return _Explanation(log, None, tuple(wrong), len(wrong) <= 1)
+        if len(best.cause.members) > 1:  # shown by one reading alone, as before the last one of a set-up
+            alone = [
+                each for each in found if each[1].cause.kind == "reading" and each[1].cause.gain >= best.cause.gain
+            ]
+            more, best = _likeliest(alone or [(more, best)])
         out = best
         if best.cause.kind != "reading":
             beside = explanations.misfit(kept, best)
@@ -473,8 +482,12 @@ def _explained(explanations: _Explanations, level: float, single: bool) -> _Expl
                 apart = dict.fromkeys(cause.name for cause in others if not {*cause.members} >= {*best.cause.members})
                 enough = len(wrong) <= 1 and beside.fit.likely
                 return _Explanation(log + more, best._replace(others=tuple(apart)), tuple(wrong), enough)
-            if not wrong and best.cause.gain > NEARLY * misfit.fit.squares:
+            far = misfit.fit.squares > FAR**2 * misfit.fit.equations
+            if far and not wrong and best.cause.gain > NEARLY * misfit.fit.squares:
                 nearly = best._replace(moved=None)
+            together, second = _likeliest(explanations.changes(beside, kept))
+            if not nearly and together > of_reading and second.cause.gain > out.cause.gain:  # several changes
+                return _Explanation(log + more + together, None, tuple(wrong), False)
             more = of_reading
         log += more
         wrong.append(out.cause)

@@ -60,7 +60,7 @@ STAYING = 1e-2
 """Change by an update, in scales, of combinations of parameters that no configuration shows, and the least part of one,
 beside released parameters, that is kept constant."""
 MOST = 4  # most successive changes of robot and frames: with more it is another robot
-FEW = 2  # more changes than this may be one of a link
+FEW = 1  # more changes than this may be one of a link
 ANOTHER = 2e-3  # change of a frame's coordinate [m, rad] above which it is another frame
 SPARED = 0.25  # largest share of wrong readings
 STRANGE = 5.0  # error over that before any calibration, above which unexplained readings are of another robot
@@ -120,8 +120,8 @@ class Update:
     their evidence before any release, the most probable first; ``moved`` are the movements of released parameters.
     ``errors`` [mm] are those of both calibrations on the readings used, and on held-out rows of the previous one if
     nothing was released. ``registered`` states that instrument or base moved so far that the base was registered again;
-    otherwise empty. ``undetermined`` are released or new frames that the new rows determine worse than their prior, and
-    changes below twice their standard deviation.
+    otherwise empty. ``undetermined`` are released parameters and frames, and new frames, that the new rows determine
+    worse than their prior, and changes below twice their standard deviation.
     """
 
     result: Calibration
@@ -176,7 +176,7 @@ class Update:
         # a moved frame explains as much as the adjacent link (base_z as d1), with more parameters
         found = [cause.gain - AS_GOOD for cause in self.changes[:1] if self.changed]
         rivals = [c for c in self.causes[1:] if c.probability > RIVAL or any(c.gain > least for least in found)]
-        rivals = [c for c in rivals if not any({*c.members} > {*cause.members} for cause in self.changes[:1])]
+        rivals = [c for c in rivals if not any({*c.members} >= {*cause.members} for cause in self.changes[:1])]
         rivals = [c for c in rivals if c.name not in {cause.name for cause in self.changes}]
         if not (rivals and self.changes):
             return ""
@@ -202,8 +202,11 @@ class Update:
             figures = f"chi-squared falls by {three_digits(cause.gain)}, posterior probability {cause.probability:.2g}"
             lines.append(f"  {cause}: {figures}{', excluded' * (cause.kind == 'reading')}.")
         moved = [str(each) for each in self.moved if not (self.registered and each.name.startswith(BASE))]
+        listed = {each.name for each in self.moved}
+        untold = [n for n in self.undetermined if n not in listed and any(n in cause.members for cause in self.changes)]
         if moved:
-            lines.append(f"Changed since then: {joined(moved)}.")
+            besides = f"; the readings do not determine {joined(untold)}" if untold else ""
+            lines.append(f"Changed since then: {joined(moved)}{besides}.")
         lines += filter(None, [self._alternatives()])
         if self.changes:
             lines.append(f"After these changes: {self.after}.")
@@ -275,7 +278,11 @@ def update(
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
     updated = _with_scales_of_motion(result, updated, released, prior_inflation)
     left_out = tuple(label for cause in changes if cause.kind == "reading" for label in cause.members)
-    moved = _moved(result, updated, released, changes)
+    widths = MULTIPLES[-1] * prior_widths(result, updated.problem)
+    widest = dict(zip(updated.problem.parameters.free.names, widths.tolist(), strict=True))
+    every = _moved(result, updated, released, changes)
+    moved = tuple(each for each in every if each.std < widest[each.name])
+    untold = tuple(each.name for each in every if each not in moved)
     unclear = {each.name for each in moved if abs(each.change) < 2 * each.std}
     vague += tuple(cause.name for cause in changes if unclear.issuperset(cause.members))
     last = Earlier(
@@ -288,7 +295,7 @@ def update(
     figures, said = _errors(result, updated, held_out)
     registered = " ".join(filter(None, [_bases(result, updated, data) if anywhere else "", said]))
     updated = replace(updated, record=_carried_on(result.record, last, source, updated.record.opened))
-    return Update(updated, first[1], after, changes, first[0], moved, len(data), figures, registered, vague)
+    return Update(updated, first[1], after, changes, first[0], moved, len(data), figures, registered, vague + untold)
 
 
 def _unresolved(vague: Sequence[str], reset: bool, after: Fit) -> Iterator[str]:
@@ -743,9 +750,9 @@ class Misfit:
 def candidates(problem: Source, reset: Sequence[str] = (), bent: bool = False) -> list[Cause]:
     """Return the candidate changes: parameters, whole frames and whole transmission errors that were not reset.
 
-    A motor that moves several joints shifts all their zeros, and a plate all measured reflectors. With ``bent``, pairs
-    of joint zeros and links are candidates, too: all six numbers between two joints, which explain most motions of a
-    frame.
+    A motor that moves several joints shifts all their zeros, and a plate all measured reflectors; two motors may have
+    been exchanged. With ``bent``, links are candidates, too: all six numbers between two joints, which explain most
+    motions of a frame.
     """
     free, data = problem.parameters.free, problem.sample().data
     place, measured = registration(free, data), {tool_prefix(m) for block in data.blocks for m in block.markers}
@@ -781,9 +788,9 @@ def _zeros(problem: Source) -> dict[str, str]:
 
 
 def _of_arms(problem: Source, zeros: Mapping[str, str], bent: bool) -> Iterator[Cause]:
-    """Yield motors that move several joints; if bent, two joint zeros, and the numbers between two joints."""
+    """Yield motors that move several joints, two joint zeros, and if bent all numbers between two joints."""
     names = problem.parameters.free.names
-    for pair in [*combinations([name for name in zeros if name in names], 2)] * bent:  # two motors that were exchanged
+    for pair in combinations([name for name in zeros if name in names], 2):  # two motors that were exchanged
         yield Cause(joined([zeros[name] for name in pair]), "joint offsets", pair)
     for which, arm in problem.arms.items():
         for motor, column in enumerate(arm.joint_map.T):
