@@ -8,13 +8,14 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import listed
+from rpim_opt.basics.text import joined, listed
 from rpim_opt.calibration.held_out import registered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.pose import position
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
+from rpim_opt.robot.mdh import numbered
 from rpim_opt.robot.parameters import frame_of, of_session, session_prefix
 
 FEW, SOME = 6, 100  # sessions that are listed at most; configurations that represent all at most
@@ -68,7 +69,10 @@ def registered_again(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
             raise InputError(", ".join(where), error.found, error.accepted) from None
         moved = {"": "the measurements were"}.get(name, f"session {name!r} was")
         motions.append(f"{moved} {motion}")
-    hidden = "A changed zero of joint 1 looks like such a motion, and would not be found."
+    arm, *_ = result.problem.arms.values()
+    first = [*arm.joint_types, "revolute"].index("revolute") or 1  # joint 1, or all linear axes of a gantry
+    zeros = joined([f"joint {numbered(i, arm.joint_names)}" for i in range(first)])
+    hidden = f"Changed zeros of {zeros} look like such a motion, and would not be found."
     return data, f"Registered again: {listed(motions, between='; ')}. {hidden}"
 
 

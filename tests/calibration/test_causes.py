@@ -1436,6 +1436,15 @@ def test_a_ready_robot_next_to_the_right_one_is_not_delivered() -> None:
     assert ro.calibrate(ro.problem_from("ur10e", data)).verdict.delivered
 
 
+def test_a_wrong_zero_of_ones_own_robot_is_no_other_ready_robot() -> None:
+    """Its robot was refused, right to 0.03 mm, in favour of the ready one, which has the same lengths."""
+    right = simulated_arm("ur5e")
+    mdh = right.robot.mdh + np.radians(4.5) * np.outer(np.eye(6)[2], np.eye(5)[2])
+    result = ro.calibrate(ro.problem_from(ro.robot.Robot("mine", mdh), right.data))
+    assert 1e3 * result.errors().mean() < 0.2
+    assert str(result.verdict) == "Delivered."
+
+
 def test_joint_values_of_another_time_on_the_way_are_named() -> None:
     """An arm is measured while it moves, with clocks 0.13 of a row apart: straight ways between rows are too far."""
     problem = ro.load("position").problem

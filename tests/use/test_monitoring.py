@@ -292,6 +292,7 @@ def test_a_link_that_was_bent_is_no_plate_of_reflectors_that_moved() -> None:
     )
     assert found.drift is not None
     assert (found.drift.cause.name, found.wrong) == ("link between joints 4 and 5", ())
+    assert "Changed zeros of joint 1, joint 2 and joint 3 look like such a motion" in str(found)
 
 
 @pytest.mark.parametrize(("checks", "first"), [(CHECKS, 12), (PLACES, 0)])

@@ -637,6 +637,15 @@ def test_bad_input_is_one_sentence(monkeypatch, capsys, tmp_path, crashed: Robot
     assert "'distance'" in capsys.readouterr().err
 
 
+def test_several_set_ups_are_updates_one_by_one(crashed: Robot, first) -> None:
+    """The refusal named robot and units, and both were right."""
+    (block,) = crashed.after.blocks
+    elsewhere = block.y + np.arange(len(block.y))[:, None] // 4 * 0.4
+    data = ro.Dataset.of(block.q[:, 0], elsewhere, SIGMA, session=[f"S{k // 4}" for k in range(len(block.y))])
+    with pytest.raises(InputError, match=r"in the same units; of several set-ups \(S0 and S1\) one at a time"):
+        ro.use.update(first, data, reset=("base_*",))
+
+
 def test_a_result_without_intervals_is_refused(crashed: Robot) -> None:
     result = ro.calibrate(crashed.problem, ro.lasso, weight=1.0)
     with pytest.raises(InputError, match="squared penalty"):

@@ -35,12 +35,13 @@ from rpim_opt.problem.registration.points import (
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, robots
-from rpim_opt.robot.mdh import Robot, numbered
+from rpim_opt.robot.mdh import MDH, Robot, numbered
 
 BETTER = 0.2  # another interpretation is reported if its position error is below this part of the present one
 RARE = 1e-6  # p-value of reported interpretations
-SIBLING, SIBLING_BETTER = 0.1, 0.5
-"""Difference of nominal parameters [m, rad] to a similar ready robot; part of the error that it may leave."""
+SIBLING, SIBLING_BETTER, SAME_LENGTH = 0.1, 0.5, 1e-3
+"""Difference of nominal parameters [m, rad] to a similar ready robot; part of the error that it may leave; difference
+of lengths [m] up to which it is the same robot."""
 FURTHER = 0.7  # a further mistake is sought behind an interpretation that leaves less than this part
 WRONG = 0.02  # errors above this part of the points' extent fit no nominal model of their robot
 LEFT = 0.05  # an interpretation with larger errors over the extent explains nothing, even with gross errors
@@ -641,7 +642,9 @@ def sibling(problem: CalibrationProblem) -> Better | None:
     own = misfit(points)
     for each in _other_robots(points):
         other = each.change(points)
-        if np.abs(other.robot.mdh - points.robot.mdh).max() < SIBLING and misfit(other) < SIBLING_BETTER * own:
+        apart = np.abs(other.robot.mdh - points.robot.mdh)
+        lengths = apart[:, [MDH.index("a"), MDH.index("d")]]  # of equal ones it is the same robot, with wrong zeros
+        if lengths.max() > SAME_LENGTH and apart.max() < SIBLING and misfit(other) < SIBLING_BETTER * own:
             return Better(each.what, each.remedy, own * points.extent, misfit(other) * points.extent)
     return None
 
