@@ -137,8 +137,9 @@ class Program(Brief):
         return Program(structure.formulation, model, structure, warm)
 
     def beginning(self, z: Array) -> Program:
-        """Return the same program with z (n,) as the start of its next solution."""
-        self._warm.begin(z)
+        """Return the same program with z (n,) as the start of its next solution, unless that is a formula."""
+        if not self.closed_form:
+            self._warm.begin(z)
         return self
 
     # --- structure -----------------------------------------------------------------------------------------------
@@ -374,6 +375,7 @@ class Program(Brief):
     def _closed(self, weight: float) -> Array:
         """Return the minimum (n,) of squares and a quadratic penalty, by QR unless it is ill-conditioned."""
         n, form, rows = self.structure.n, self.penalty_form, self.squared.qr_factor
+        rows = rows[rows.any(axis=1)]  # fewer equations than parameters have fewer
         if form is not None and weight > 0:
             rows = np.vstack([rows, np.sqrt(weight) * np.column_stack([form.matrix, form.c])])
         T = reduced_rows(rows)

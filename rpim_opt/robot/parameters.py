@@ -202,22 +202,22 @@ class Parameters(Tabled):
         """Return the indices (6,) of a frame's parameters by their prefix, ``base_``: position, roll, pitch, yaw."""
         return np.array([self.names.index(prefix + axis) for axis in FRAME_DIMENSION])
 
-    @property
+    @cached_property
     def of_frames(self) -> np.ndarray:
         """Which parameters (P,) are of frames (base, reflectors, sessions, ...), not of the robot."""
         return np.array([not of_joint(name) and name not in self.terms for name in self.names])
 
-    @property
+    @cached_property
     def of_curves(self) -> np.ndarray:
         """Which parameters (P,) are coefficients of transmission errors: hundreds without individual meaning."""
         return np.array([own_name(name).startswith("transmission") for name in self.names], dtype=bool)
 
-    @property
+    @cached_property
     def placed(self) -> np.ndarray:
         """Which frame parameters (P,) have no informative prior: all except session offsets."""
         return self.of_frames & ~np.array([of_session(name) for name in self.names], dtype=bool)
 
-    @property
+    @cached_property
     def groups(self) -> tuple[str, ...]:
         """The scale groups (P) of the parameters: ``base``, ``tool``, ``session``, or their dimension."""
         return tuple(
@@ -332,6 +332,8 @@ def overlay(
     A name has precedence over a pattern, a pattern over a group. Errors name ``where`` and ``file``; ``signed`` is
     whether zero and negative values are accepted.
     """
+    if not table:
+        return values.copy()
     members: dict[str, list[int]] = {}  # parameters by key: groups, joint offsets, patterns of the table, names
     for i, group in enumerate(parameters.groups):
         members.setdefault(group, []).append(i)
