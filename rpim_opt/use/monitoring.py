@@ -37,7 +37,6 @@ SET_UP_ANEW = 3.0  # factor of errors without over with registration of every se
 DAY = 86400.0  # seconds
 FAR, NEARLY = 100.0, 0.9
 """Standard deviations of a motion that may be beyond linearization, and the part of chi-squared that it explains."""
-LINK = -10.0  # added to ln of a link's prior probability: frames that it nearly explains move more often
 MOTION = 1.0  # prior standard deviation of a motion determined from the checks [m, rad]
 
 
@@ -366,8 +365,7 @@ class _Explanations:
         readings = list(recalibration.readings(problem, self.model))
         self.equations = {cause.members: rows for cause, rows in readings}
         causes = [*recalibration.candidates(framed, bent=bent), *(cause for cause, _ in readings)]
-        rarer = [LINK * (cause.kind == "link") for cause in causes]
-        self.priors = dict(zip(causes, (recalibration.log_priors(causes) + rarer).tolist(), strict=True))
+        self.priors = dict(zip(causes, recalibration.log_priors(causes).tolist(), strict=True))
 
     def columns(self, drift: Drift) -> Array:
         """Return the effect (m, c) of a change: from its first check on, or linear over the checks if it is steady."""
@@ -477,11 +475,9 @@ def _explained(explanations: _Explanations, level: float, single: bool) -> _Expl
             beside = explanations.misfit(kept, best)
             of_reading, out = _likeliest(explanations.readings(beside, kept))
             if out.cause.p_value * len(found) >= level:
-                least = best.cause.gain - recalibration.AS_GOOD
-                others = [drift.cause for _, drift in found if drift.cause.gain > least]  # but those that contain it
-                apart = dict.fromkeys(cause.name for cause in others if not {*cause.members} >= {*best.cause.members})
+                others = recalibration.as_good(best.cause, (drift.cause for _, drift in found))
                 enough = len(wrong) <= 1 and beside.fit.likely
-                return _Explanation(log + more, best._replace(others=tuple(apart)), tuple(wrong), enough)
+                return _Explanation(log + more, best._replace(others=tuple(others)), tuple(wrong), enough)
             far = misfit.fit.squares > FAR**2 * misfit.fit.equations
             if far and not wrong and best.cause.gain > NEARLY * misfit.fit.squares:
                 nearly = best._replace(moved=None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -61,6 +61,7 @@ STAYING = 1e-2
 beside released parameters, that is kept constant."""
 MOST = 4  # most successive changes of robot and frames: with more it is another robot
 FEW = 1  # more changes than this may be one of a link
+LINK = -10.0  # added to ln of a link's prior probability: a frame moves more often, and is nearly explained by one
 ANOTHER = 2e-3  # change of a frame's coordinate [m, rad] above which it is another frame
 SPARED = 0.25  # largest share of wrong readings
 STRANGE = 5.0  # error over that before any calibration, above which unexplained readings are of another robot
@@ -173,12 +174,13 @@ class Update:
 
     def _alternatives(self) -> str:
         """Return a sentence on other changes that the readings do not distinguish from those found; empty if none."""
-        # a moved frame explains as much as the adjacent link (base_z as d1), with more parameters
-        found = [cause.gain - AS_GOOD for cause in self.changes[:1] if self.changed]
-        rivals = [c for c in self.causes[1:] if c.probability > RIVAL or any(c.gain > least for least in found)]
-        rivals = [c for c in rivals if not any({*c.members} >= {*cause.members} for cause in self.changes[:1])]
-        rivals = [c for c in rivals if c.name not in {cause.name for cause in self.changes}]
-        if not (rivals and self.changes):
+        if not self.changes:
+            return ""
+        best, of_changes = self.changes[0], {cause.name for cause in self.changes}
+        named = as_good(best, self.causes[1:]) * self.changed
+        rivals = [c for c in self.causes[1:] if c.name in named or (c.probability > RIVAL and not contains(c, best))]
+        rivals = [c for c in rivals if c.name not in of_changes]
+        if not rivals:
             return ""
         frames = [cause.name for cause in rivals if cause.kind == "frame"]
         remedy = "measure more."
@@ -327,7 +329,7 @@ def _in_turn(
     Return all causes and the fit before any release, the last calibration, its released parameters, the changes in the
     order of discovery, and the fit after them.
     """
-    changes: list[Cause] = []
+    stated, changes = released, list[Cause]()
     most = {"reading": max(SPARED * len(np.unique(problem.data.configuration)), 1), "link": 1}
     first: Weighed | None = None
     while True:
@@ -342,8 +344,9 @@ def _in_turn(
         say(f"releasing {cause.name}")
         changes.append(cause)
         problem = problem.with_parameters(updated.problem.parameters)  # with the base if it was registered
-        if cause.kind == "reading":
-            problem = problem.without(set(cause.members))
+        if cause.kind == "reading":  # what changed is sought again without it, which two zeros may have explained
+            problem, released = problem.without(set(cause.members)), stated
+            changes = [each for each in changes if each.kind == "reading"]
         else:
             released += cause.members
         start = updated.x
@@ -493,9 +496,7 @@ def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple
     left, motion = fit.squares - best.gain, registered_fit.squares - base.gain
     if between and left > NOTICED**2 * (fit.equations - len(best.members)):
         return between, ""
-    rivals = [
-        cause.name for cause in others if cause.gain > best.gain - AS_GOOD and not {*best.members} < {*cause.members}
-    ]
+    rivals = as_good(best, others)
     if motion - left <= AS_GOOD:
         alone = best.members[0].startswith(place) and not rivals
         return likely if alone or left - motion > AS_GOOD else moved
@@ -839,11 +840,25 @@ def _weighed(
     return tuple(weighed), misfit.fit
 
 
+def contains(one: Cause, other: Cause) -> bool:
+    """Whether a cause has all members of another one."""
+    return {*one.members} >= {*other.members}
+
+
+def as_good(best: Cause, causes: Iterable[Cause]) -> list[str]:
+    """Return the names of causes that leave as little chi-squared as the best one, a frame as a length along its axis.
+
+    Those that contain it do not count, and links, which explain most motions of a frame.
+    """
+    rivals = [cause for cause in causes if cause.gain > best.gain - AS_GOOD and cause.kind != "link"]
+    return list(dict.fromkeys(cause.name for cause in rivals if not contains(cause, best)))
+
+
 def log_priors(causes: Sequence[Cause]) -> Array:
-    """Return ln of the prior probabilities of causes (C,): equal for all kinds, and for all causes of a kind."""
+    """Return ln of the prior probabilities of causes (C,): equal for all kinds but links, and for causes of a kind."""
     kinds = [cause.kind for cause in causes]
     share = (1 - UNCHANGED) / len(set(kinds))
-    return np.log([share / kinds.count(kind) for kind in kinds])
+    return np.log([share / kinds.count(kind) for kind in kinds]) + [LINK * (kind == "link") for kind in kinds]
 
 
 def log_bayes_factor(g: Array, G: Array, width: Array) -> float:

@@ -230,6 +230,17 @@ def test_two_motors_that_were_exchanged_at_once_are_both_named(zeros: tuple[str,
     assert {name for cause in found.changes for name in cause.members} == {*zeros}
 
 
+@pytest.mark.parametrize(("seed", "zero"), [(7, "theta2"), (8, "theta3")])
+def test_a_gross_reading_makes_one_motor_no_pair(seed: int, zero: str) -> None:
+    robot = happened(seed, **{zero: 9e-4})
+    (block,) = robot.after.blocks
+    y = block.y + np.outer(np.arange(len(block.y)) == 4, [6e-4, -5e-4, 4e-4])
+    found = ro.use.update(
+        ro.calibrate(robot.problem.on(robot.before)), replace(robot.after, blocks=(replace(block, y=y),))
+    )
+    assert [str(cause) for cause in found.changes] == ["reading 5", f"joint offset {zero}"]
+
+
 def test_all_zeros_after_an_overhaul_are_changes_of_zeros_alone() -> None:
     """A link between two of the joints was named with probability 1, whose other numbers were zero."""
     zeros = {"theta2": 5e-4, "theta3": -7e-4, "theta4": 9e-4, "theta5": -1e-3}
