@@ -126,7 +126,8 @@ class Monitoring:
         count = f"{len(self.label)} checks"
         out = {label for cause in self.wrong for label in cause.members}
         lines = [f"No drift in {count}."]
-        if self.drift or self.alarm is not None or any(self.label[i] not in out for i in self.beyond):
+        deviates = self.drift or self.alarm is not None or any(self.label[i] not in out for i in self.beyond)
+        if deviates:
             lines = [f"The robot deviates from its calibration ({count}).", *filter(None, [self.mistake])]
         elif self.wrong:
             lines = [f"No drift in {len(self.label) - len(out)} of {count}; the others are wrong readings."]
@@ -145,16 +146,18 @@ class Monitoring:
         if self.drift is not None:
             cause, first = self.drift.cause, self.drift.first
             what = f"{cause.kind} {self.drift.moved}" if self.drift.moved else str(cause)
-            course = {0: "before the first check"}.get(first, f"in one step before {self._named(first)}")
+            course, rows = f"in one step before {self._named(first)}", " with the checks from then on"
             if self.drift.steady:
-                course = "steadily from the first to the last check"
+                course, rows = "steadily from the first to the last check", " with the last ones"
+            elif not first:
+                course, rows = "before the first check", ""
             lines.append(
                 f"Best explained by {what}, {course}: chi-squared falls by "
-                f"{three_digits(cause.gain)}, p-value {cause.p_value:.2g}. Recalibrate by `update`."
+                f"{three_digits(cause.gain)}, p-value {cause.p_value:.2g}. Recalibrate by `update`{rows}."
             )
             if self.drift.others:
                 lines.append(f"A change of {joined(self.drift.others)} explains the checks as well: measure more.")
-        elif self.drifts and not self.wrong:
+        elif deviates:
             lines.append("No single parameter or frame explains the deviation. Recalibrate by `update`.")
         worst = int(np.argmax(self.sigmas / self.allowed))
         lines.append(
@@ -217,7 +220,8 @@ def monitor(
     problem = recalibration.with_data(result, recalibration.by_visit(data, visit))
     level = recalibration.FALSE_ALARM / TESTS
     sigmas, deviate, equations = _innovations(result, problem, own, level / count)
-    drift, wrong = _drift(result, problem, own, level)
+    course = np.arange(count) if when is None or np.ptp(when) == 0 else when - when[0]
+    drift, wrong = _drift(result, problem, own, course / max(course[-1], 1), level)
     right = ~np.isin(data.label, [label for cause in wrong for label in cause.members])
     held = held_out_errors(result, data)
     if unknown := unregistered(result, data, held):  # which would appear as a change of the robot
@@ -349,7 +353,7 @@ class _Explanations:
     time of the first.
     """
 
-    def __init__(self, result: Calibration, problem: CalibrationProblem, own: Array, bent: bool) -> None:
+    def __init__(self, result: Calibration, problem: CalibrationProblem, own: Array, course: Array, bent: bool) -> None:
         framed, base, mine = _framed(problem)
         self.result, self.free, self.count = result, framed.parameters.free, len(problem.data)
         self.form = recalibration.penalty_of(recalibration.posterior_as_prior(result, problem), len(mine))
@@ -360,6 +364,7 @@ class _Explanations:
         self.width = recalibration.prior_widths(result, framed) / self.free.scale
         numbers, first = np.unique(problem.data.configuration, return_index=True)
         self.when, self.starts = first[np.searchsorted(numbers, model.group)], np.sort(first).tolist()
+        self.course = course[self.when]
         moments = np.linspace(0, len(self.starts) - 1, min(len(self.starts), MOMENTS))
         self.moments = np.unique(moments.round().astype(int)).tolist()
         readings = list(recalibration.readings(problem, self.model))
@@ -369,7 +374,7 @@ class _Explanations:
 
     def columns(self, drift: Drift) -> Array:
         """Return the effect (m, c) of a change: from its first check on, or linear over the checks if it is steady."""
-        course = self.when / (self.count - 1) if drift.steady else self.when >= drift.first
+        course = self.course if drift.steady else self.when >= drift.first
         return self.A[:, self._places(drift.cause)] * course[:, None]
 
     def misfit(self, kept: Array, beside: Drift | None = None) -> recalibration.Misfit:
@@ -425,19 +430,20 @@ def _likeliest(found: Iterable[Explained]) -> Explained:
 
 
 def _drift(
-    result: Calibration, problem: CalibrationProblem, own: Array, level: float
+    result: Calibration, problem: CalibrationProblem, own: Array, course: Array, level: float
 ) -> tuple[Drift | None, tuple[recalibration.Cause, ...]]:
     """Return the change that explains checks best, set-ups moved or not, and the readings that are wrong by themselves.
 
-    None and an empty tuple if chance explains the checks, considering all causes that were tried.
+    A steady change has its ``course`` (N,), from 0 to 1. None and an empty tuple if chance explains the checks,
+    considering all causes that were tried.
     """
-    explanations = _Explanations(result, problem, own, False)
+    explanations = _Explanations(result, problem, own, course, False)
     found = [_explained(explanations, level, True)]
     if not found[-1].enough:  # many wrong readings may be a change
         found.append(_explained(explanations, level, False))
     drift = found[-1].drift
     if not found[-1].enough or (drift and len(drift.cause.members) > 1):  # and several changes one of a link
-        found.append(_explained(_Explanations(result, problem, own, True), level, False))
+        found.append(_explained(_Explanations(result, problem, own, course, True), level, False))
     best = max(found, key=lambda each: (each.log, each.drift is not None))
     return best.drift, best.wrong
 

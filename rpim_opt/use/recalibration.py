@@ -49,6 +49,7 @@ from rpim_opt.robot.parameters import (
     tool_prefix,
 )
 from rpim_opt.store.result_file import content
+from rpim_opt.use.compensation import tool_uncertainty
 from rpim_opt.use.sessions import base_frame, registered_again
 
 FALSE_ALARM = 0.01  # false-alarm probability over all causes for a robot that did not change or drift
@@ -62,7 +63,6 @@ beside released parameters, that is kept constant."""
 MOST = 4  # most successive changes of robot and frames: with more it is another robot
 FEW = 1  # more changes than this may be one of a link
 LINK = -10.0  # added to ln of a link's prior probability: a frame moves more often, and is nearly explained by one
-ANOTHER = 2e-3  # change of a frame's coordinate [m, rad] above which it is another frame
 SPARED = 0.25  # largest share of wrong readings
 STRANGE = 5.0  # error over that before any calibration, above which unexplained readings are of another robot
 RIVAL, AS_GOOD = 0.05, 4.0  # of a further cause to be named: probability, or chi-squared above the best
@@ -336,8 +336,9 @@ def _in_turn(
         updated = _recalibrated(result, problem, released, inflation, start)
         causes, after = _weighed(result, updated.problem, updated.x, updated.formulation, released, bent)
         first = first or (causes, after)
-        # the most probable cause that chance does not explain
-        cause = next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)
+        # the most probable cause that chance does not explain, where a change is more probable than none
+        changed = sum(cause.probability for cause in causes) > UNCHANGED
+        cause = next((cause for cause in causes if changed and cause.p_value * len(causes) < FALSE_ALARM), None)
         alike = [each for each in changes if cause and (each.kind == "reading") == (cause.kind == "reading")]
         if cause is None or len(alike) >= most.get(cause.kind, MOST):
             return first, updated, released, tuple(changes), after
@@ -535,19 +536,16 @@ def _moved(
 ) -> tuple[Moved, ...]:
     """Return the movements of released parameters, except curves' coefficients; those of reset ones from both results.
 
-    For changed parameters the uncertainty common to both results does not count; for a frame that is another one, as
-    that of a new tool, it does, since the orientation in which it is stated is uncertain, too.
+    For changed parameters the uncertainty common to both results does not count, but in proportion to the motion of a
+    frame: if position and orientation in which it is stated are off by s and w, a motion by t and f appears off by
+    w x t + f x s, and its rotation by w x f.
     """
     free = updated.problem.parameters.free
     curves = np.array(free.names)[free.of_curves].tolist()
     # deviations of a registered frame refer to another orientation, values do not
     was, now = (each.problem.parameters.by_name(each.x) for each in (result, updated))
 
-    def another(cause: Cause) -> bool:
-        far = (abs(now[name] - was.get(name, now[name])) > ANOTHER for name in cause.members)
-        return cause.kind == "reading" or (cause.kind == "frame" and any(far))
-
-    changed = [name for cause in changes if not another(cause) for name in cause.members if name not in curves]
+    changed = [n for cause in changes if cause.kind != "reading" for n in cause.members if n not in curves]
     reset = [name for name in released if name not in changed]
     moved: list[Moved] = []
     for name in [name for name in reset if name in result.problem.parameters.free.names and name not in curves]:
@@ -565,8 +563,27 @@ def _moved(
     g, G = misfit.projected(slice(misfit.m), misfit.A[:, index])
     covariance = free.scale[index, None] * np.linalg.pinv(G, hermitian=True) * free.scale[index]
     change, std = covariance @ (g / free.scale[index]), np.sqrt(np.diag(covariance))
+    frames = np.array(
+        [name.rpartition("_")[0] * bool(free.of_frames[i]) for name, i in zip(changed, index, strict=True)]
+    )
+    turns = np.array(free.dimensions)[index] == "angle"
+    common = np.sqrt(np.diag(updated.covariance)[index])
+    for frame in {*frames} - {""}:
+        own = frames == frame
+        at, turning = own & ~turns, own & turns
+        t, f, s = (np.linalg.norm(each) for each in (change[at], change[turning], common[at]))
+        w = np.linalg.norm(common[turning]) if turning.any() else _turned(updated, frame)
+        std[at], std[turning] = np.hypot(std[at], np.hypot(w * t, f * s)), np.hypot(std[turning], w * f)
     rows = zip(changed, index, change.tolist(), std.tolist(), strict=True)
     return (*moved, *(Moved(name, free.dimensions[i], d, s) for name, i, d, s in rows))
+
+
+def _turned(result: Calibration, frame: str) -> float:
+    """Return the largest standard deviation [rad] of the flange, in whose frame a reflector is stated; else zero."""
+    robot, _, own = frame.rpartition(".")
+    q = next(block.q[:, 0] for block in result.problem.sample().data.blocks if block.robot == robot)
+    marker = own.removeprefix("tool").removeprefix("_")
+    return float(tool_uncertainty(result, q, None, marker, robot)[1].max()) if own.startswith("tool") else 0.0
 
 
 def penalty_of(formulation: Formulation, n: int) -> Quadratic:

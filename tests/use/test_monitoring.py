@@ -133,6 +133,16 @@ def test_a_step_is_before_the_first_reading_of_its_configuration() -> None:
     assert (drift.cause.name, checks.label[drift.first]) == ("theta3", checks.label[15])
 
 
+def test_a_slow_drift_is_linear_in_time() -> None:
+    """Its ramp followed the rows, six of which are read on a day: 10 % too much, or a step where a visit came late."""
+    month = np.array([0.0, 4.0, 5.0, 6.0])[np.arange(CHECKS) // PLACES]
+    found = ro.use.monitor(*checked(2, 1e-3 / 6 * month), 86400 * 30 * month)
+    assert found.drift is not None
+    assert (found.drift.cause.name, found.drift.steady) == ("theta3", True)
+    assert found.drift.moved is not None
+    assert abs(found.drift.moved.change - 1e-3) < 3 * found.drift.moved.std
+
+
 def test_a_slow_drift_is_no_step() -> None:
     found = ro.use.monitor(*checked(2, np.linspace(0, 1e-3, CHECKS)))
     assert found.drift is not None
