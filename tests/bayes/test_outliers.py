@@ -130,7 +130,7 @@ def test_a_gross_error_of_few_positions_is_found() -> None:
         assert not left_out[0]
         assert {*left_out[1]} <= {f"P{row + 1}"}
         found += len(left_out[1])
-    assert found >= 10
+    assert found >= 11
 
 
 def test_a_resistant_fit_to_fewer_rows_than_parameters_is_the_shortest_one() -> None:
