@@ -2,6 +2,7 @@ from . import baselines as baselines
 from .acceptance import Acceptance as Acceptance
 from .acceptance import accept as accept
 from .certificate import Certificate as Certificate
+from .diagnosis import Outside as Outside
 from .held_out import refit_all as refit_all
 from .identify import calibrate as calibrate
 from .inspection import Inspection as Inspection
@@ -13,6 +14,7 @@ from .leverage import influence as influence
 from .loop import Iteration as Iteration
 from .outcome import Prediction as Prediction
 from .result import Calibration as Calibration
+from .uncertainty import TransmissionError as TransmissionError
 from .uncertainty import Uncertainty as Uncertainty
 from .uncertainty import monte_carlo as monte_carlo
 from .uncertainty import transmission_errors as transmission_errors

@@ -83,7 +83,10 @@ def flagged(problem: Source, x: Array) -> tuple[Flag, ...]:
 
 @dataclass(frozen=True)
 class Outside:
-    """Rows, of ``count``, outside the measured joint ranges, and how many of them by each joint (from 1)."""
+    """Rows outside the measured joint ranges: their numbers ``rows``, of ``count`` considered ones.
+
+    ``joints`` are how many of them are outside by each joint (from 1).
+    """
 
     count: int = 0
     rows: tuple[int, ...] = ()

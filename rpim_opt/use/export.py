@@ -367,12 +367,12 @@ def _write_urdf(
         at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
         there = f"in its frame the reflector is at {at}; --tip-measured (tip_measured=True) moves it there"
         notes.append(f"URDF: {tip} keeps its pose from the file; {there}.")
-    notes += _tip_uncertainty(result, tip or "the tip link", at_tip, marker or known[0], robot)
+    notes += _uncertainty_of(result, tip or "the tip link", at_tip, marker or known[0], robot)
     return notes + write_urdf(source, arm.robot, target, root, tip, base, tool)
 
 
-def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: str, robot: str) -> list[str]:
-    """Return a sentence on the uncertainty of the tip link, at ``tool`` in the flange frame or at the reflector."""
+def _uncertainty_of(result: Calibration, what: str, tool: Array | None, marker: str, robot: str) -> list[str]:
+    """Return a sentence on the uncertainty of a frame, at ``tool`` in the flange frame or at the reflector."""
     problem = result.problem.sample().alone(robot)
     blocks = [block for block in problem.data.blocks if block.q.shape[2] == problem.robot.dof]
     q = np.concatenate([block.q[:, 0] for block in blocks])
@@ -380,11 +380,11 @@ def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: 
     if not (position or turn):  # no identified parameter moves it
         return []
     if not np.isfinite([position, turn]).all():
-        return ["URDF: the pose of its tip link is undetermined: check position and orientation by other means."]
+        return [f"The pose of {what} is undetermined: check position and orientation by other means."]
     rests = " Positions of one reflector determine only part of its pose, the prior the rest."
     return [
-        "URDF: expanded uncertainty in the instrument's frame (k = 2, largest of the measured configurations): "
-        f"{tip} {2e3 * position:.2g} mm and {2e3 * turn:.2g} mrad.{rests * (not turns_measured(problem))}"
+        "Expanded uncertainty in the instrument's frame (k = 2, largest of the measured configurations): "
+        f"{what} {2e3 * position:.2g} mm and {2e3 * turn:.2g} mrad.{rests * (not turns_measured(problem))}"
     ]
 
 
@@ -409,7 +409,7 @@ def _write_ur_kinematics(result: Calibration, robot: str, marker: str | None, so
     notes.append(
         "The ROS driver reads these origins; the controller keeps its own kinematics, and the hash is unchanged."
     )
-    return [*notes, _of_controller(result, marker, arm), *write_ur_kinematics(source, arm.robot, target)]
+    return [*notes, *_of_controller(result, marker, arm, robot), *write_ur_kinematics(source, arm.robot, target)]
 
 
 def _write_ur_calibration(result: Calibration, robot: str, marker: str | None, source: Path, target: Path) -> list[str]:
@@ -438,11 +438,12 @@ def _write_ur_calibration(result: Calibration, robot: str, marker: str | None, s
         notes.append(
             "calibration.conf cannot hold the tilt and offset of axis 1 (alpha1, a1): its Base is defined on axis 1."
         )
-    return [*notes, _of_controller(result, marker, replace(arm, base=frame_numbers(numeric_frame(arm.base) @ axis)))]
+    arm = replace(arm, base=frame_numbers(numeric_frame(arm.base) @ axis))
+    return [*notes, *_of_controller(result, marker, arm, robot)]
 
 
-def _of_controller(result: Calibration, marker: str | None, arm: RobotSetup) -> str:
-    """Return the TCP and the Base that belong to a robot in files of Universal Robots, as PolyScope states poses."""
+def _of_controller(result: Calibration, marker: str | None, arm: RobotSetup, robot: str) -> list[str]:
+    """Return TCP and Base that belong to a robot in files of Universal Robots, as PolyScope states poses, and U."""
     known = reflectors(result.problem.parameters.names)
     which = "the reflector" if len(known) == 1 else f"reflector {marker or known[0]} (--marker states another)"
     half = np.pi * bool((arm.robot.mdh[2:4, 1] > 0).all())  # from ROS's base_link to Base
@@ -452,10 +453,11 @@ def _of_controller(result: Calibration, marker: str | None, arm: RobotSetup) -> 
         vector = scipy.spatial.transform.Rotation.from_matrix(T[:3, :3]).as_rotvec()
         angles = (f"{name} {value:z.5f}" for name, value in zip(("RX", "RY", "RZ"), vector, strict=True))
         texts.append(f"{' '.join(lengths)} mm, {' '.join(angles)} rad")
-    return (
+    return [
         f"TCP to enter in PolyScope for {which} (rotation vector, from the tool flange): {texts[0]}. "
-        f"The controller's Base in the instrument's frame (rotation vector): {texts[1]}."
-    )
+        f"The controller's Base in the instrument's frame (rotation vector): {texts[1]}.",
+        *_uncertainty_of(result, "the flange", np.zeros(6), marker or known[0], robot),
+    ]
 
 
 def _on_base(arm: RobotSetup, nominal: Robot, of_file: Robot, file: Path) -> tuple[RobotSetup, list[str]]:

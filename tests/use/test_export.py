@@ -54,6 +54,9 @@ def test_files_of_universal_robots_state_the_tcp_and_the_base_that_belong_to_the
     path.write_bytes(target.read_bytes())
     ro.use.export_files(result, target, **options, despite_verdict=True)
     assert target.read_text().count("TCP to enter") == 1
+    assert re.search(
+        r"largest of the measured configurations\): the flange [\d.]+ mm and [\d.]+ mrad\.", target.read_text()
+    )
     q = configurations(6)
     if file.endswith("conf"):
         flange = reach(ro.robot.read_ur_calibration(target, UR10), q)
