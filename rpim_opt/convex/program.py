@@ -375,7 +375,7 @@ class Program(Brief):
     def _closed(self, weight: float) -> Array:
         """Return the minimum (n,) of squares and a quadratic penalty, by QR unless it is ill-conditioned."""
         n, form, rows = self.structure.n, self.penalty_form, self.squared.qr_factor
-        rows = rows[rows.any(axis=1)]  # fewer equations than parameters have fewer
+        rows = rows[rows.any(axis=1)]  # those of fewer equations than parameters are zero below
         if form is not None and weight > 0:
             rows = np.vstack([rows, np.sqrt(weight) * np.column_stack([form.matrix, form.c])])
         T = reduced_rows(rows)

@@ -204,10 +204,11 @@ class Update:
             figures = f"chi-squared falls by {three_digits(cause.gain)}, posterior probability {cause.probability:.2g}"
             lines.append(f"  {cause}: {figures}{', excluded' * (cause.kind == 'reading')}.")
         moved = [str(each) for each in self.moved if not (self.registered and each.name.startswith(BASE))]
-        listed = {each.name for each in self.moved}
-        untold = [n for n in self.undetermined if n not in listed and any(n in cause.members for cause in self.changes)]
+        known = {each.name for each in self.moved}
+        members = {name for cause in self.changes for name in cause.members} - known
+        unknown = joined([name for name in self.undetermined if name in members])
         if moved:
-            besides = f"; the readings do not determine {joined(untold)}" if untold else ""
+            besides = f"; the readings do not determine {unknown}" * bool(unknown)
             lines.append(f"Changed since then: {joined(moved)}{besides}.")
         lines += filter(None, [self._alternatives()])
         if self.changes:
@@ -329,7 +330,7 @@ def _in_turn(
     Return all causes and the fit before any release, the last calibration, its released parameters, the changes in the
     order of discovery, and the fit after them.
     """
-    stated, changes = released, list[Cause]()
+    reset, changes = released, list[Cause]()
     most = {"reading": max(SPARED * len(np.unique(problem.data.configuration)), 1), "link": 1}
     first: Weighed | None = None
     while True:
@@ -346,7 +347,7 @@ def _in_turn(
         changes.append(cause)
         problem = problem.with_parameters(updated.problem.parameters)  # with the base if it was registered
         if cause.kind == "reading":  # what changed is sought again without it, which two zeros may have explained
-            problem, released = problem.without(set(cause.members)), stated
+            problem, released = problem.without(set(cause.members)), reset
             changes = [each for each in changes if each.kind == "reading"]
         else:
             released += cause.members
