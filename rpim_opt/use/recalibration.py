@@ -206,10 +206,9 @@ class Update:
         moved = [str(each) for each in self.moved if not (self.registered and each.name.startswith(BASE))]
         known = {each.name for each in self.moved}
         members = {name for cause in self.changes for name in cause.members} - known
-        unknown = joined([name for name in self.undetermined if name in members])
+        unknown = [f"; the readings do not determine {name}" for name in self.undetermined if name in members]
         if moved:
-            besides = f"; the readings do not determine {unknown}" * bool(unknown)
-            lines.append(f"Changed since then: {joined(moved)}{besides}.")
+            lines.append(f"Changed since then: {joined(moved)}{''.join(unknown)}.")
         lines += filter(None, [self._alternatives()])
         if self.changes:
             lines.append(f"After these changes: {self.after}.")
