@@ -37,6 +37,7 @@ SET_UP_ANEW = 3.0  # factor of errors without over with registration of every se
 DAY = 86400.0  # seconds
 FAR, NEARLY = 100.0, 0.9
 """Standard deviations of a motion that may be beyond linearization, and the part of chi-squared that it explains."""
+UNDELIVERED = "The calibration is not delivered: its prediction intervals may hide a change of the robot."
 MOTION = 1.0  # prior standard deviation of a motion determined from the checks [m, rad]
 
 
@@ -70,7 +71,7 @@ class Monitoring:
     ``sums`` (N,) their cumulative sum (CUSUM) and ``limit`` its limit. ``drift`` is the change that explains them best,
     None if chance does; ``wrong`` are readings that an error of their own explains better, left out of sums and
     changes; ``mistake`` is a sentence on a likely mistake in the checks; ``registered`` states the motions of
-    registered checks.
+    registered checks, ``undelivered`` that the calibration is not delivered.
     """
 
     label: tuple[str, ...]
@@ -85,6 +86,7 @@ class Monitoring:
     wrong: tuple[recalibration.Cause, ...] = ()
     mistake: str = ""
     registered: str = ""
+    undelivered: str = ""
 
     @property
     def beyond(self) -> tuple[int, ...]:
@@ -115,6 +117,7 @@ class Monitoring:
             "wrong": [_shown(cause) for cause in self.wrong],
             "mistake": self.mistake,
             "registered": self.registered,
+            "undelivered": self.undelivered,
             "rows": records(self._columns()),
         }
 
@@ -165,7 +168,7 @@ class Monitoring:
             f"({self.allowed[worst]:.1f} allowed), {1e3 * self.error[worst]:.3f} mm. "
             f"Largest cumulative sum: {self.sums.max():.1f} ({self.limit:.1f} allowed)."
         )
-        return "\n".join([*lines, *filter(None, [self.registered])])
+        return "\n".join([*lines, *filter(None, [self.registered, self.undelivered])])
 
     @property
     def since(self) -> int | None:
@@ -231,6 +234,7 @@ def monitor(
         allowed=np.sqrt(equations * fdtri(equations, max(result.noise_dof, 1.0), 1 - level / count)),
         sums=cusum(deviate * right), limit=cusum_limit(count, level), drift=drift, wrong=wrong, registered=motion,
         mistake=_mistake(result, data, when, right, register, drift),
+        undelivered=UNDELIVERED * (not result.verdict.delivered),
     )  # fmt: skip
 
 

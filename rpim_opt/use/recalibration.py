@@ -182,10 +182,11 @@ class Update:
         rivals = [c for c in rivals if c.name not in of_changes]
         if not rivals:
             return ""
-        frames = [cause.name for cause in rivals if cause.kind == "frame"]
         remedy = "measure more."
-        if frames:
-            remedy = f"if the reflector was exchanged or the instrument moved, use --reset '{frames[0]}_*'."
+        for frame in [cause for cause in rivals if cause.kind == "frame"][:1]:
+            pattern = frame.name.replace("all reflectors", "tool")
+            moved = "reflector was exchanged" if "tool" in pattern else "instrument moved"
+            remedy = f"if the {moved}, use --reset '{pattern}_*'."
         names = joined([cause.name for cause in rivals])
         return f"These readings do not distinguish this from a change of {names}: {remedy}"
 

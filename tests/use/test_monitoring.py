@@ -62,6 +62,18 @@ def test_a_robot_that_stays_as_it_is() -> None:
     assert str(found).startswith("No drift in 24 checks.")
 
 
+def test_checks_of_a_robot_that_is_not_delivered_say_so() -> None:
+    """No drift was the answer of intervals of 60 mm."""
+    result, data = checked(0, np.zeros(CHECKS))
+    (block,) = result.problem.data.blocks
+    off = 0.02 * np.random.default_rng(1).normal(size=block.y.shape)
+    shaken = result.problem.on(replace(result.problem.data, blocks=(replace(block, y=block.y + off),)))
+    found = ro.use.monitor(ro.calibrate(shaken), data)
+    assert str(found).splitlines()[0] == "No drift in 24 checks."
+    assert "The calibration is not delivered: its prediction intervals may hide a change of the robot." in str(found)
+    assert not ro.use.monitor(result, data).undelivered
+
+
 def test_a_step_is_found_with_its_moment_and_size() -> None:
     found = ro.use.monitor(*checked(1, np.where(np.arange(CHECKS) >= 12, 5e-4, 0.0)))
     assert found.drifts

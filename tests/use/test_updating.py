@@ -347,9 +347,11 @@ def test_an_exchanged_reflector_has_its_remedy() -> None:
     robot = happened(6, tool_z=1.5e-3)
     first = ro.calibrate(robot.problem.on(robot.before))
     found = ro.use.update(first, robot.after)
-    assert "if the reflector was exchanged or the instrument moved, use --reset 'tool_*'." in str(found)
+    assert "if the reflector was exchanged, use --reset 'tool_*'." in str(found)
     again = ro.use.update(first, robot.after, reset=("tool_*",))
     assert not again.changed
+    plate = found.causes[0]._replace(name="all reflectors", kind="frame", members=("tool_A_z", "tool_B_z"))
+    assert "use --reset 'tool_*'." in str(replace(found, causes=(found.causes[0], plate)))
     d6 = [result.problem.parameters.by_name(result.x)["d6"] for result in (first, found.result, again.result)]
     assert abs(d6[1] - d6[0]) > 1e-3
     assert abs(d6[2] - d6[0]) < 1e-5
