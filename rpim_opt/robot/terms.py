@@ -245,12 +245,12 @@ def require_columns(columns: Mapping[str, str], where: str) -> None:
 
 def term_motion(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | None:
     """Return the motion of a term, (1, 1) or (6, 1); None if its parameters are all zero."""
-    sizes = [value(name) for name in term.names(joint.number)]
+    own = [value(name) for name in term.names(joint.number)]
     # building an effect may need the whole chain: skipped without its parameter
-    if sizes and all(size == 0 if isinstance(size, float) else ca.SX(size).is_zero() for size in sizes):
+    if own and all(each == 0 if isinstance(each, float) else ca.SX(each).is_zero() for each in own):
         return None
     try:
-        moves = term.moves(joint, *sizes)
+        moves = term.moves(joint, *own)
     except (AttributeError, TypeError, RuntimeError) as error:  # a Python `if` of a symbol raises RuntimeError
         accepted = f"moves({', '.join([term.at, *(entry.name for entry in term.entries)])}) using only what `Joint` has"
         accepted += " and functions of CasADi (ca.if_else)"

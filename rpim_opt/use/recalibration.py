@@ -270,22 +270,13 @@ def update(
     released += tuple(name for name in unplaced if name not in released)
     anywhere = bool(base) and {*base} <= {*released}  # a reset base is registered again
     start = None if anywhere else previous_deviations(result, problem)
-    found = _in_turn(result, problem, released, prior_inflation, start, say, False)
-    if len(found[3]) > FEW or not found[-1].likely:  # many changes of parameters and readings may be one of a link
-        of_link = _in_turn(result, problem, released, prior_inflation, start, say, True)
-        if of_link[-1].likely and (len(of_link[3]) < len(found[3]) or not found[-1].likely):
-            found = of_link
-    first, updated, released, changes, after = found
+    first, updated, released, changes, after = _fewest(result, problem, released, prior_inflation, start, say)
     if not after.likely:
         _refuse_another_robot(result, updated, data, bool({*base} & {*released}))
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
     updated = _with_scales_of_motion(result, updated, released, prior_inflation)
     left_out = tuple(label for cause in changes if cause.kind == "reading" for label in cause.members)
-    widths = MULTIPLES[-1] * prior_widths(result, updated.problem)
-    widest = dict(zip(updated.problem.parameters.free.names, widths.tolist(), strict=True))
-    every = _moved(result, updated, released, changes)
-    moved = tuple(each for each in every if each.std < widest[each.name])
-    untold = tuple(each.name for each in every if each not in moved)
+    moved, unknown = _moved(result, updated, released, changes)
     unclear = {each.name for each in moved if abs(each.change) < 2 * each.std}
     vague += tuple(cause.name for cause in changes if unclear.issuperset(cause.members))
     last = Earlier(
@@ -298,7 +289,7 @@ def update(
     figures, said = _errors(result, updated, held_out)
     registered = " ".join(filter(None, [_bases(result, updated, data) if anywhere else "", said]))
     updated = replace(updated, record=_carried_on(result.record, last, source, updated.record.opened))
-    return Update(updated, first[1], after, changes, first[0], moved, len(data), figures, registered, vague + untold)
+    return Update(updated, first[1], after, changes, first[0], moved, len(data), figures, registered, vague + unknown)
 
 
 def _unresolved(vague: Sequence[str], reset: bool, after: Fit) -> Iterator[str]:
@@ -316,6 +307,28 @@ def _unresolved(vague: Sequence[str], reset: bool, after: Fit) -> Iterator[str]:
         )
 
 
+Changed = tuple[Weighed, Calibration, tuple[str, ...], tuple[Cause, ...], Fit]
+"""All causes and the fit before any release, the last calibration, its released parameters, the changes in the order of
+discovery, and the fit after them."""
+
+
+def _fewest(
+    result: Calibration,
+    problem: CalibrationProblem,
+    released: tuple[str, ...],
+    inflation: float,
+    start: Array | None,
+    say: Callable[[str], None],
+) -> Changed:
+    """Return the changes in turn; those with a link, of which several may be one, if they are fewer or alone likely."""
+    found = _in_turn(result, problem, released, inflation, start, say, False)
+    if len(found[3]) <= FEW and found[-1].likely:
+        return found
+    of_link = _in_turn(result, problem, released, inflation, start, say, True)
+    fewer = len(of_link[3]) < len(found[3]) or not found[-1].likely
+    return of_link if of_link[-1].likely and fewer else found
+
+
 def _in_turn(
     result: Calibration,
     problem: CalibrationProblem,
@@ -324,12 +337,8 @@ def _in_turn(
     start: Array | None,
     say: Callable[[str], None],
     bent: bool,
-) -> tuple[Weighed, Calibration, tuple[str, ...], tuple[Cause, ...], Fit]:
-    """Release the most probable change, one after the other, until chance explains the rest.
-
-    Return all causes and the fit before any release, the last calibration, its released parameters, the changes in the
-    order of discovery, and the fit after them.
-    """
+) -> Changed:
+    """Release the most probable change, one after the other, until chance explains the rest."""
     reset, changes = released, list[Cause]()
     most = {"reading": max(SPARED * len(np.unique(problem.data.configuration)), 1), "link": 1}
     first: Weighed | None = None
@@ -534,8 +543,10 @@ def _changes(result: Calibration, data: Dataset) -> Weighed:
 
 def _moved(
     result: Calibration, updated: Calibration, released: Sequence[str], changes: Sequence[Cause]
-) -> tuple[Moved, ...]:
-    """Return the movements of released parameters, except curves' coefficients; those of reset ones from both results.
+) -> tuple[tuple[Moved, ...], tuple[str, ...]]:
+    """Return the movements of released parameters, and the names of those that are less known than by their prior.
+
+    Curves' coefficients are left out; the movements of reset parameters are from both results.
 
     For changed parameters the uncertainty common to both results does not count, but in proportion to the motion of a
     frame: if position and orientation in which it is stated are off by s and w, a motion by t and f appears off by
@@ -557,7 +568,7 @@ def _moved(
             change = np.angle(np.exp(1j * change))
         moved.append(Moved(name, free.dimensions[i], float(change), float(std)))
     if not changed:
-        return tuple(moved)
+        return _known(moved, result, updated)
     index = [free.names.index(name) for name in changed]
     penalty = penalty_of(posterior_as_prior(result, updated.problem, reset), len(free))
     misfit = Misfit(result, updated.problem.linearize(updated.x), penalty)
@@ -576,7 +587,18 @@ def _moved(
         w = np.linalg.norm(common[turning]) if turning.any() else _turned(updated, frame)
         std[at], std[turning] = np.hypot(std[at], np.hypot(w * t, f * s)), np.hypot(std[turning], w * f)
     rows = zip(changed, index, change.tolist(), std.tolist(), strict=True)
-    return (*moved, *(Moved(name, free.dimensions[i], d, s) for name, i, d, s in rows))
+    moved += [Moved(name, free.dimensions[i], d, s) for name, i, d, s in rows]
+    return _known(moved, result, updated)
+
+
+def _known(
+    moved: Sequence[Moved], result: Calibration, updated: Calibration
+) -> tuple[tuple[Moved, ...], tuple[str, ...]]:
+    """Return the movements that are better known than by the prior of released parameters, and the others' names."""
+    widths = MULTIPLES[-1] * prior_widths(result, updated.problem)
+    widest = dict(zip(updated.problem.parameters.free.names, widths.tolist(), strict=True))
+    known = tuple(each for each in moved if each.std < widest[each.name])
+    return known, tuple(each.name for each in moved if each not in known)
 
 
 def _turned(result: Calibration, frame: str) -> float:
