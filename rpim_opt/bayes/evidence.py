@@ -16,8 +16,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.prior import BASE
 from rpim_opt.problem.noise import Repeatability, Stack
 
-CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1.0}
-"""Prior medians of the robot's repeatability [m, rad, rad], and of the factor on the instrument's noise."""
+CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "reading": 1e-5, "instrument": 1.0}
+"""Prior medians of the robot's repeatability [m, rad, rad, m], and of the factor on the instrument's noise."""
 CURVES = {"transmission size": (1e-4, 2.0), "transmission length": (0.2, 1.5)}
 """Hyperparameters of transmission errors: prior median [rad], and standard deviation of the natural logarithm."""
 WAVES, WAVES_LENGTH = 1.5e-4, 1.0

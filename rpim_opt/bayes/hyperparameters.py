@@ -87,11 +87,11 @@ class Learned(Brief):
     """Hyperparameters estimated from the data.
 
     ``scales`` are those of the groups of deviations over the stated ones; ``noise`` is the robot's repeatability in
-    ``position`` [m], ``orientation`` and ``joint`` [rad], and ``instrument`` over the stated noise; ``covariance`` (s,
-    s) is that of the logarithms of both. ``local`` (n,) are local scales of deviations over those of their groups, 1
-    without heavy tails; ``stated`` (n,) the stated scales [SI]. ``trials`` are the compared models, the selected one
-    first; ``value`` is the final -2 ln of the restricted likelihood, ``noise_dof`` the degrees of freedom of a
-    reading's variance (Satterthwaite). ``drift`` (n, k) is D, where D D' is the covariance [SI] due to uncertain
+    ``position`` [m], ``orientation`` and ``joint`` [rad], ``reading`` [m], and ``instrument`` over the stated noise;
+    ``covariance`` (s, s) is that of the logarithms of both. ``local`` (n,) are local scales of deviations over those of
+    their groups, 1 without heavy tails; ``stated`` (n,) the stated scales [SI]. ``trials`` are the compared models, the
+    selected one first; ``value`` is the final -2 ln of the restricted likelihood, ``noise_dof`` the degrees of freedom
+    of a reading's variance (Satterthwaite). ``drift`` (n, k) is D, where D D' is the covariance [SI] due to uncertain
     hyperparameters, heavy tails, and model errors outside the measured ranges. ``left_out`` are excluded outliers, the
     worst first, ``added`` parameters of model extensions, ``notes`` sentences on what the marginal likelihood leaves
     undecided, ``contradicted`` sentences on known values that the data contradict, and ``curves`` the joints'
@@ -215,6 +215,8 @@ class Estimator:
         have = {"instrument"}
         if any(stack.unit is not None or stack.length.any() for stack in stacks):
             have |= {"position", "joint"}
+        if problem.touches is None and any(stack.unit is not None and stack.length.any() for stack in stacks):
+            have.add("reading")
         if any(stack.angle.any() for stack in stacks):
             have.add("orientation")
         noise = tuple(kind for kind in self.noise if kind in have)

@@ -38,7 +38,7 @@ LARGE = 3.0  # ln(new scale over its prior median) at which the search for an op
 COMPARED = 1e-2  # derivatives of -2 ln L by ln(hyperparameters) at which models are compared
 ROUNDS = 3  # linearizations at which the hyperparameters of the selected model are estimated
 SPEAK = 10.0  # decrease of -2 ln L for an extension to be reported: false ones gain 4, none of many gained 10
-NOISE = ("position", "orientation", "joint")  # parts of the noise in a comparison at a result
+NOISE = ("position", "orientation", "joint", "reading")  # parts of the noise in a comparison at a result
 KNOWN = Prior(joint_offset=1.0, frames=1.0)  # prior with scales estimated before, as the problem has them
 
 

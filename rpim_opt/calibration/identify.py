@@ -34,13 +34,13 @@ from rpim_opt.problem.registration.global_start import JointMapping, find_mappin
 
 LOGGER = getLogger("rpim_opt")
 NOISE = {
-    "robot": ("position", "orientation", "joint"),
-    "free": ("position", "orientation", "joint", "instrument"),
+    "robot": ("position", "orientation", "joint", "reading"),
+    "free": ("position", "orientation", "joint", "reading", "instrument"),
     "level": ("instrument",),
     "declared": (),
 }
 """Estimated components of the noise, by the option's name."""
-MODELS = {"geometry": ("position", "orientation", "instrument"), "auto": NOISE["free"]}
+MODELS = {"geometry": ("position", "orientation", "reading", "instrument"), "auto": NOISE["free"]}
 """Components of the noise by model: without extensions, deflection under gravity would count as joint noise."""
 LEVEL = 1e-9  # relative decrease of the objective over five iterations that is no progress
 DIVERGES = "poorly identifiable combinations diverge without a penalty; add one."

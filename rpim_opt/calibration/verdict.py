@@ -82,7 +82,12 @@ LIMITED = "the formulation, not the robot, limits the fit"
 """Beginning of the cause if loss, penalty or constraints contradict the data."""
 REMARKS = (BAD, SLIGHTLY)  # beginnings of sentences on delivered robots, too
 OVERSTATED = 0.05  # residual RMS over the stated noise below which the statement is wrong; for nominal errors 1 / NOISY
-REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
+REPEATABILITY = {
+    "position": ("mm", 2e-3),
+    "orientation": ("mrad", 8e-3),
+    "joint": ("mrad", 5e-3),
+    "reading": ("mm", 2e-3),
+}
 """Estimated repeatability [m, rad] beyond any robot's, whatever the stated noise; a service robot had 5.3 mrad."""
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
 """Deviation of machined dimensions [rad, m] beyond any robot's; joint zeros, set at assembly, are not limited."""
@@ -438,7 +443,7 @@ def _repeatability(result: Outcome) -> Iterator[str]:
         )
     for kind in (kind for kind in noise if kind in REPEATABILITY):
         size, (unit, largest) = noise[kind], REPEATABILITY[kind]
-        dimension = "length" if kind == "position" else "angle"
+        dimension = "length" if unit == "mm" else "angle"
         variance = stated_variance(result.problem, dimension)
         measured = variance[variance > 0]
         if len(measured) and kind != "joint":  # the stated noise is of all components together

@@ -26,7 +26,12 @@ from rpim_opt.robot.parameters import EXPANSION, is_joint_offset, of_session, ow
 
 MOST_ROWS, MOST_BOUNDS = 8, 5  # outliers and active bounds named individually
 LAST_DIGIT = 1e-4  # resolution of parameter tables [mm, degree]
-WHERE = {"position": "in position along each axis", "orientation": "in orientation", "joint": "at the joints"}
+WHERE = {
+    "position": "in position along each axis",
+    "orientation": "in orientation",
+    "joint": "at the joints",
+    "reading": "of each reading",
+}
 """Wording of the components of the robot's repeatability."""
 DEFLECTIONS = {
     "compliance": "deflection of joints under gravity",

@@ -27,20 +27,25 @@ class Repeatability:
 
     The covariance of all readings of one configuration is::
 
-        instrument^2 Sigma + position^2 I_length + orientation^2 I_angle + joint^2 J_theta J_theta'
+        instrument^2 Sigma + reading^2 I_length + position^2 J_p J_p' + orientation^2 I_angle
+        + joint^2 J_theta J_theta'
 
-    with Sigma as stated by the rows and J_theta (k, dof) the derivatives by the angles of the revolute joints: the
-    error of a joint affects every reflector of a configuration, in proportion to the lever arm.
+    with Sigma as stated by the rows, J_p (k, 3) the derivatives by the robot's place and J_theta (k, dof) those by the
+    angles of the revolute joints: an error in position displaces all reflectors of a configuration alike, that of a
+    joint in proportion to the lever arm.
 
-    ``position`` [m] and ``orientation`` [rad] are standard deviations of every measured length and angle without the
-    joints' part, ``joint`` [rad] that of every revolute joint; ``instrument`` multiplies the stated noise. ``at`` (P,)
-    are the values of all parameters at which the derivatives are taken [SI], nominal if None.
+    ``position`` [m] is the standard deviation of every coordinate of the robot's place and ``orientation`` [rad] that
+    of every measured angle, both without the joints' part, ``joint`` [rad] that of every revolute joint, and
+    ``reading`` [m] that of every measured length by itself, as by seats of reflectors and returns of the robot: only
+    configurations with several readings tell it from ``position``. ``instrument`` multiplies the stated noise. ``at``
+    (P,) are the values of all parameters at which the derivatives are taken [SI], nominal if None.
     """
 
     position: float = 0.0
     orientation: float = 0.0
     joint: float = 0.0
     instrument: float = 1.0
+    reading: float = 0.0
     at: Array | None = None
 
 
@@ -50,8 +55,8 @@ class Stack:
 
     ``index`` (N, k) are numbers of the equations; ``instrument`` (N, k, k) is the covariance stated by the rows [SI];
     ``length`` and ``angle`` (N, k) mark lengths and angles; ``joint`` (N, k, dof) are derivatives by the revolute
-    joints' angles [SI], dof columns per stop of the joints, or none; ``unit`` (N, k, k), or None for 1, is the
-    covariance for unit variance of every position if equations mix several, or a camera sees several points.
+    joints' angles [SI], dof columns per stop of the joints, or none; ``unit`` (N, k, k), or None for every length by
+    itself, is the covariance for unit variance of every position if readings share it, or equations mix several.
     """
 
     index: np.ndarray
@@ -69,9 +74,8 @@ class Stack:
     def covariance(self, repeatability: Repeatability, reading: bool = True) -> Array:
         """Return the covariances (N, k, k) [SI] of the residuals; without the instrument's part if not of a reading."""
         k = self.index.shape[1]
-        own = repeatability.orientation**2 * self.angle
-        if self.unit is None:
-            own = repeatability.position**2 * self.length + own
+        of_length = repeatability.reading**2 + repeatability.position**2 * (self.unit is None)
+        own = of_length * self.length + repeatability.orientation**2 * self.angle
         covariance = own[:, :, None] * np.eye(k)
         if self.unit is not None:
             covariance += repeatability.position**2 * self.unit
@@ -114,7 +118,10 @@ class Equations(NamedTuple):
         return cls(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
     def stack(self, index: np.ndarray, slopes: Array | None = None, shifts: Array | None = None) -> Stack:
-        """Return the noise of equations (N, k), from their slopes (m, dof) by joints, and (m, 3) by a robot's place."""
+        """Return the noise of equations (N, k), from their slopes (m, dof) by joints, and (m, 3) by the robot's place.
+
+        Lengths that do not depend on the place, as between two robots, vary by themselves.
+        """
         row = self.row[index]
         V = self.covariance[index[:, :, None], self.component[index][:, None, :]]
         V = V * (row[:, :, None] == row[:, None, :])
@@ -123,7 +130,8 @@ class Equations(NamedTuple):
         unit = None
         if shifts is not None:
             G = shifts[index]
-            unit = G @ G.transpose(0, 2, 1) + length[:, :, None] * np.eye(index.shape[1])
+            own = length & ~G.any(axis=2)
+            unit = G @ G.transpose(0, 2, 1) + own[:, :, None] * np.eye(index.shape[1])
         return Stack(index, V, length, self.angle[index], joint, unit)
 
     def grouped(self, number: np.ndarray) -> list[np.ndarray]:

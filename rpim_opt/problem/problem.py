@@ -531,15 +531,28 @@ class CalibrationProblem(RobotModel):
     def _stacked(self, groups: Iterable[np.ndarray], joints: bool, at: Array | None) -> list[Stack]:
         """Return groups of equations (N, k) with the components of their noise; arguments as for `stacks`."""
         slopes = self.joint_slopes(at) if joints else None
-        shifts = None
-        seen = [block.measurement.metres is not None for block in self.data.blocks]
-        if any(seen):  # an error in the pose of a carried camera or board shifts all points of a view together
-            places = {
-                name: SHIFTED.index(own_name(name)) for name in self.parameters.names if own_name(name) in SHIFTED
-            }
-            camera = np.repeat(seen, [index.size for index in equation_numbers(self.data)])
-            shifts = self._slopes_by(places, len(SHIFTED), at) * camera[:, None]
+        shifts = self.place_slopes(at) if self._shared_place else None
         return [self._equations.stack(index, slopes, shifts) for index in groups]
+
+    @cached_property
+    def _shared_place(self) -> bool:
+        """Whether readings share an error in position: several of a configuration, or a camera's view."""
+        if any(block.measurement.metres is not None for block in self.data.blocks):
+            return True
+        return self.touches is None and len(np.unique(self.data.configuration)) < len(self.data)
+
+    def place_slopes(self, at: Array | None = None) -> Array:
+        """Return derivatives (m, 3) of modelled values by the robot's place [SI], at all parameters' values ``at``."""
+        places = {name: SHIFTED.index(own_name(name)) for name in self.parameters.names if own_name(name) in SHIFTED}
+        return self._slopes_by(places, len(SHIFTED), at)
+
+    def common_errors(self) -> Array:
+        """Return the effects (m, c) [SI] of one standard deviation of joints, and of the place if readings share it."""
+        known = self.repeatability
+        if known is None:
+            return np.zeros((len(self._equations.row), 0))
+        place = [known.position * self.place_slopes(known.at)] * self._shared_place
+        return np.hstack([known.joint * self.joint_slopes(known.at), *place])
 
     def covariances(self, reading: bool = True) -> list[Array]:
         """Return the covariance of every row's residual, block by block, (N, k, k) or (1, k, k) for all [SI].

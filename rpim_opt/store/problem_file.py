@@ -206,6 +206,7 @@ class RepeatabilityTable(Table):
     position: Length = Field(default=0.0, ge=0)
     orientation: Angle = Field(default=0.0, ge=0)
     joint: Angle = Field(default=0.0, ge=0)
+    reading: Length = Field(default=0.0, ge=0)
 
 
 class GridTable(Table):

@@ -281,9 +281,10 @@ def _innovations(
         e = r - J m,    S = J C J' + V,    K = C J' S^-1,    m + K e,    C - K J C
 
     with |S^-1/2 e| in standard deviations, V the covariance of a reading, and C the remaining covariance after
-    calibration and earlier checks. Deviates are from Fisher's F, positive if a check misses more than usual. A check
-    less probable than ``level`` does not update the filter. Components that nothing earlier predicts, as in the first
-    checks of a set-up with rows ``own`` (s, N), are no equations.
+    calibration and earlier checks. Errors that all readings of a visit share are estimated with it, and anew at the
+    next visit. Deviates are from Fisher's F, positive if a check misses more than usual. A check less probable than
+    ``level`` does not update the filter. Components that nothing earlier predicts, as in the first checks of a set-up
+    with rows ``own`` (s, N), are no equations.
     """
     C = result.known_covariance
     if C is None:
@@ -295,20 +296,30 @@ def _innovations(
     n = len(known)
     C = np.pad(np.where(np.outer(known, known), C, 0.0), (0, len(wide)))
     C[n:, n:] = np.diag(wide**2)
-    m = np.zeros(len(C))
     residual, slopes = framed.slopes(recalibration.previous_deviations(result, framed))
+    common = problem.common_errors()
+    of_visit = slice(len(C), len(C) + common.shape[1])
+    C = np.pad(C, (0, common.shape[1]))
+    m = np.zeros(len(C))
     readings = noise_covariances(problem, result.variance_factor).reading
     rows: dict[int, tuple[Array, Array]] = {}
-    for (block, part), V in zip(by_block(problem, np.column_stack([residual, slopes])), readings, strict=True):
+    for (block, part), V in zip(by_block(problem, np.column_stack([residual, slopes, common])), readings, strict=True):
         of_rows = zip(part, np.broadcast_to(V, (len(part), *V.shape[1:])), strict=True)
         rows |= zip(block.row.tolist(), of_rows, strict=True)
     freedom = max(result.noise_dof, 1.0)
     sigmas, p_values, degrees = np.zeros(len(rows)), np.full(len(rows), 0.5), np.zeros(len(rows), dtype=int)
-    for t, (equations, V) in sorted(rows.items()):
-        r, A = equations[:, 0], equations[:, 1:]
-        J = np.hstack([A[:, mine], np.kron(own[:, t], A[:, base])])
-        S = J @ C @ J.T + V
-        e = r - J @ m
+    configuration, visit = problem.data.configuration, None
+    first, of_row = np.unique(configuration, return_index=True, return_inverse=True)[1:]
+    for t in np.argsort(first[of_row], kind="stable").tolist():
+        equations, V = rows[t]
+        r, A, D = np.split(equations, [1, 1 + slopes.shape[1]], axis=1)
+        if configuration[t] != visit:
+            visit = configuration[t]
+            m[of_visit], C[of_visit], C[:, of_visit] = 0.0, 0.0, 0.0
+            C[of_visit, of_visit] = np.eye(D.shape[1])
+        J = np.hstack([A[:, mine], np.kron(own[:, t], A[:, base]), D])
+        S = J @ C @ J.T + V - D @ D.T
+        e = r[:, 0] - J @ m
         s, U = scipy.linalg.eigh(S, V)
         told = s < UNINFORMATIVE
         degrees[t] = told.sum()

@@ -23,6 +23,9 @@ LIMITS = {"x": 1e-9, "weight": 1e-8, "objective": 1e-8, "std": 1e-7, "expanded":
 """Largest differences that are rounding: of x by prior scale, of all else relative."""
 CONDITIONAL = ("std", "expanded")  # covariances are conditional on equations and active bounds
 INTENDED = {
+    "cable": ("hyperparameters",),  # where a configuration has several readings, these have a variance of their own
+    "markers": ("hyperparameters",),
+    "mixed": ("hyperparameters",),
     "constrained:equal_links": CONDITIONAL,
     "constrained:parallel_axes": CONDITIONAL,
     "constrained:everything": CONDITIONAL,

@@ -13,7 +13,7 @@ from rpim_opt.problem import Repeatability
 from rpim_opt.problem.blocks import reduced
 from rpim_opt.problem.linear import reduced_rows
 
-REPEATABILITY = Repeatability(position=4e-5, orientation=1e-4, joint=7e-5, instrument=0.8)
+REPEATABILITY = Repeatability(position=4e-5, orientation=1e-4, joint=7e-5, instrument=0.8, reading=2e-5)
 NAMES = ("position", "pose", "markers", "mixed", "cable", "distance")
 
 
@@ -34,10 +34,14 @@ def dense(problem: ro.CalibrationProblem, repeatability: Repeatability) -> Array
     for C in V:
         R[at : at + len(C), at : at + len(C)] = repeatability.instrument**2 * C
         at += len(C)
-    R += np.diag(repeatability.position**2 * np.array(lengths) + repeatability.orientation**2 * np.array(angles))
     T = problem.joint_slopes(repeatability.at)
+    p = problem.parameters
+    moved = replace(p, identified=np.isin(p.names, ["base_x", "base_y", "base_z"]))
+    G = problem.with_parameters(moved).jacobian(np.zeros(moved.identified.sum()))
+    own = np.where(np.any(G, axis=1), 0.0, repeatability.position**2)  # distances without a base in the model
+    R += np.diag((repeatability.reading**2 + own) * lengths + repeatability.orientation**2 * np.array(angles))
     same = np.equal.outer(groups, groups)
-    return R + repeatability.joint**2 * np.where(same, T @ T.T, 0.0)
+    return R + np.where(same, repeatability.joint**2 * T @ T.T + repeatability.position**2 * G @ G.T, 0.0)
 
 
 @pytest.mark.parametrize("name", NAMES)
