@@ -23,9 +23,6 @@ LIMITS = {"x": 1e-9, "weight": 1e-8, "objective": 1e-8, "std": 1e-7, "expanded":
 """Largest differences that are rounding: of x by prior scale, of all else relative."""
 CONDITIONAL = ("std", "expanded")  # covariances are conditional on equations and active bounds
 INTENDED = {
-    "cable": ("hyperparameters",),  # where a configuration has several readings, these have a variance of their own
-    "markers": ("hyperparameters",),
-    "mixed": ("hyperparameters",),
     "constrained:equal_links": CONDITIONAL,
     "constrained:parallel_axes": CONDITIONAL,
     "constrained:everything": CONDITIONAL,
@@ -66,6 +63,8 @@ REGISTERED = ("camera", "constrained", "constrained:tolerances", "constrained:ce
 """The estimated scale of a registered base no longer says what joint 1 may be off: standard deviations of both are a
 third to three times larger, predictions by 1e-4 of theirs at most."""
 INTENDED |= {name: (*INTENDED.get(name, ()), *CONDITIONAL) for name in REGISTERED}
+SEVERAL = ("cable", "markers", "mixed")  # readings of one configuration: these have a variance of their own
+INTENDED |= {name: (*INTENDED.get(name, ()), "hyperparameters") for name in SEVERAL}
 
 
 def problems() -> list[tuple[str, str | None]]:

@@ -147,7 +147,7 @@ def test_a_step_is_before_the_first_reading_of_its_configuration() -> None:
 
 @pytest.mark.parametrize("common", [True, False], ids=["of the robot", "of each seat"])
 def test_an_error_in_position_is_common_to_the_reflectors_of_a_stop(common: bool) -> None:
-    """Joints of a SCARA do not explain it: as one of each reading, it raised false alarms in these three of ten cases."""
+    """Joints of a SCARA do not explain it: as one of each reading, it raised alarms in these three of ten cases."""
     robot = ro.load("scara").problem.robot
     for seed in (0, 2, 4):
         problem = simulated_arm(robot, seed, count=60, markers=3)
