@@ -437,9 +437,11 @@ def _flange(candidates: Candidates, zero: Array) -> list[Array]:
     axes = np.empty((dof, 3, B, N))
     origins = np.empty((dof, 3, B, N))
     for j, (alpha, a, theta, d, beta) in enumerate(candidates.mdh.transpose(1, 2, 0)[..., None]):
-        c, s = np.cos(alpha), np.sin(alpha)
-        y, z = c * y + s * z, c * z - s * y
-        p = p + a * x
+        if alpha.any():  # most sheets have zeros
+            c, s = np.cos(alpha), np.sin(alpha)
+            y, z = c * y + s * z, c * z - s * y
+        if a.any():
+            p = p + a * x
         axes[j] = z
         origins[j] = p
         turning = candidates.joint_types[j] == "revolute"
