@@ -28,6 +28,7 @@ from rpim_opt.calibration.held_out import sets
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import transmission_errors
+from rpim_opt.calibration.verdict import scatter
 from rpim_opt.calibration.words import underdetermined
 from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.problem.blocks import Source
@@ -195,6 +196,8 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
     """Return notes for every file and of the geometry, remarks, whether that is inconclusive; or raise NotDelivered."""
     accepted, found = tested(whole)
     verdict, said = alone.verdict, {"inconclusive": inconclusive(whole, found)}
+    if not scatter(whole):  # residuals of the extensions that are left out, which another note states
+        verdict = replace(verdict, caution=verdict.caution.replace(scatter(alone), "").strip())
     if accepted:
         verdict, said = accepted.on(verdict), {accepted.verdict: accepted.summary}
     remarks = list(filter(None, [whole.no_intervals, said.get("accepted")]))

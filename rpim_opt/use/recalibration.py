@@ -538,7 +538,8 @@ def _between_rows(result: Calibration, data: Dataset) -> str:
 def _changes(result: Calibration, data: Dataset) -> Weighed:
     """Return all that may have changed before new measurements, as of `_weighed`, at the previous deviations."""
     problem = with_data(result, data)
-    return _weighed(result, problem, previous_deviations(result, problem), posterior_as_prior(result, problem), ())
+    x, prior = previous_deviations(result, problem), posterior_as_prior(result, problem)
+    return _weighed(result, problem, x, prior, (), bent=True)
 
 
 def _moved(

@@ -156,14 +156,25 @@ def test_exported_geometry_is_fitted_to_the_rows_that_only_gravity_explains() ->
     assert ro.use.geometry_alone(result)[0].problem.labels == result.problem.labels
 
 
-def bent() -> ro.CalibrationProblem:
-    """Return the problem of a geometry alone, measured on an arm that bends."""
+def bent(times: float = 1.0) -> ro.CalibrationProblem:
+    """Return the problem of a geometry alone, measured on an arm that bends, and so many times as far."""
     robot = arm()
     q = np.random.default_rng(1).uniform(-2.0, 2.0, (40, 6))
     real = ro.CalibrationProblem(robot, table(robot), data_at(q))
-    y = real.modelled(truth(real.parameters, 1))[0] + SIGMA * np.random.default_rng(2).normal(size=(40, 3))
+    x = truth(real.parameters, 1)
+    x[[name.startswith("compliance") for name in real.parameters.free.names]] *= times
+    y = real.modelled(x)[0] + SIGMA * np.random.default_rng(2).normal(size=(40, 3))
     rigid = ro.robot.model_parameters(robot, tools={"": TOOL}).identify(GEOMETRY)
     return ro.CalibrationProblem(robot, rigid, ro.Dataset.of(q, y, SIGMA))
+
+
+def test_gravity_that_files_cannot_hold_is_no_scatter_of_readings(tmp_path: Path) -> None:
+    """They asked for a loose reflector or an instrument that something shook."""
+    result = ro.calibrate(bent(4.0), model="auto")
+    assert result.verdict.caution == ""
+    notes = " ".join(ro.use.export_files(result, mdh=tmp_path / "arm.toml").notes)
+    assert "Files cannot hold gravity: their geometry is from a separate fit" in notes
+    assert "loose" not in notes
 
 
 def test_of_extensions_at_a_given_weight_files_hold_the_geometry_of_a_formulation_of_ones_own(tmp_path: Path) -> None:

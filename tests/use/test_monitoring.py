@@ -330,12 +330,14 @@ def test_a_link_that_was_bent_is_no_plate_of_reflectors_that_moved() -> None:
     q, names = places(8), [[*tools], *[["R1"]] * 7]
     later = replace(arm, mdh=arm.mdh + bent)
     visits = [readings(robot, q, names, session=[f"M{k}"]) for k, robot in enumerate([arm] * 3 + [later] * 3)]
-    found = ro.use.monitor(
-        ro.calibrate(problem), ro.Dataset.together(visits, [v.session[0] for v in visits]), register=True
-    )
+    result = ro.calibrate(problem)
+    found = ro.use.monitor(result, ro.Dataset.together(visits, [v.session[0] for v in visits]), register=True)
     assert found.drift is not None
     assert (found.drift.cause.name, found.wrong) == ("link between joints 4 and 5", ())
     assert "Changed zeros of joint 1, joint 2 and joint 3 look like such a motion" in str(found)
+    # another joint's backlash was likely, which leaves far more
+    checked = ro.use.validate(result, readings(later, places(20), [[*tools]] * 20))
+    assert checked.mistake.startswith("Likely: link between joints 4 and 5 changed: that leaves chi-squared ")
 
 
 @pytest.mark.parametrize(("checks", "first"), [(CHECKS, 12), (PLACES, 0)])
