@@ -235,11 +235,13 @@ def scatter(result: Outcome) -> str:
     if ratio <= NOISY or size <= most or sum(len(block.row) - repeated(block).max() - 1 for block in blocks) >= FEWEST:
         return ""
     noise = f"{three_digits(ratio)} times the {'assumed' if result.record.noise_assumed else 'stated'} noise"
+    tried = result.learned is not None and len(result.learned.trials) > 1
+    bends = "" if tried else 'Does the arm bend under gravity, or do its gears err (model = "auto")? '
     return (
         f"Readings scatter by {three_digits(1e3 * size)} mm RMS, {noise} and more than industrial robots of this size "
-        f"({three_digits(1e3 * most)} mm): did the arm vibrate, or something shake the instrument? Is the reflector, "
-        "tool or base loose? Are joint values commanded, not read? Repeat five configurations, and state the "
-        "instrument's noise ([noise])."
+        f"({three_digits(1e3 * most)} mm). {bends}Did the arm vibrate, or something shake the instrument? Is the "
+        "reflector, tool or base loose? Are joint values commanded, not read? Repeat five configurations, and state "
+        "the instrument's noise ([noise])."
     )
 
 

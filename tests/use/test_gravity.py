@@ -169,9 +169,11 @@ def bent(times: float = 1.0) -> ro.CalibrationProblem:
 
 
 def test_gravity_that_files_cannot_hold_is_no_scatter_of_readings(tmp_path: Path) -> None:
-    """They asked for a loose reflector or an instrument that something shook."""
+    """They asked for a loose reflector or an instrument that something shook, also where gravity was not tried."""
     result = ro.calibrate(bent(4.0), model="auto")
     assert result.verdict.caution == ""
+    rigid = ro.calibrate(bent(4.0), "tikhonov", "reml")
+    assert "mm). Does the arm bend under gravity, or do its gears err" in rigid.verdict.caution
     notes = " ".join(ro.use.export_files(result, mdh=tmp_path / "arm.toml").notes)
     assert "Files cannot hold gravity: their geometry is from a separate fit" in notes
     assert "loose" not in notes
