@@ -65,6 +65,7 @@ FEW = 1  # more changes than this may be one of a link
 LINK = -10.0  # added to ln of a link's prior probability: a frame moves more often, and is nearly explained by one
 SPARED = 0.25  # largest share of wrong readings
 STRANGE = 5.0  # error over that before any calibration, above which unexplained readings are of another robot
+VAGUE = 0.5  # of the standard deviation of a changed parameter's prior, above which nothing determines its change
 RIVAL, AS_GOOD = 0.05, 4.0  # of a further cause to be named: probability, or chi-squared above the best
 SHOWN = 5  # number of causes shown
 BASE, PLACE = "base_", 0.1
@@ -551,7 +552,7 @@ def _moved(
 
     For changed parameters the uncertainty common to both results does not count, but in proportion to the motion of a
     frame: if position and orientation in which it is stated are off by s and w, a motion by t and f appears off by
-    w x t + f x s, and its rotation by w x f.
+    w x t + f x s, and its rotation by w x f. A reflector is measured itself, wherever it is: without s.
     """
     free = updated.problem.parameters.free
     curves = np.array(free.names)[free.of_curves].tolist()
@@ -569,12 +570,14 @@ def _moved(
             change = np.angle(np.exp(1j * change))
         moved.append(Moved(name, free.dimensions[i], float(change), float(std)))
     if not changed:
-        return _known(moved, result, updated)
+        return _known(moved, changed, result, updated)
     index = [free.names.index(name) for name in changed]
     penalty = penalty_of(posterior_as_prior(result, updated.problem, reset), len(free))
     misfit = Misfit(result, updated.problem.linearize(updated.x), penalty)
     g, G = misfit.projected(slice(misfit.m), misfit.A[:, index])
-    covariance = free.scale[index, None] * np.linalg.pinv(G, hermitian=True) * free.scale[index]
+    wide = MULTIPLES[-1] * prior_widths(result, updated.problem)[index] / free.scale[index]
+    inverse = np.linalg.inv(G + np.diag(wide**-2.0))  # what nothing determines stays within its prior
+    covariance = free.scale[index, None] * inverse * free.scale[index]
     change, std = covariance @ (g / free.scale[index]), np.sqrt(np.diag(covariance))
     frames = np.array(
         [name.rpartition("_")[0] * bool(free.of_frames[i]) for name, i in zip(changed, index, strict=True)]
@@ -585,20 +588,21 @@ def _moved(
         own = frames == frame
         at, turning = own & ~turns, own & turns
         t, f, s = (np.linalg.norm(each) for each in (change[at], change[turning], common[at]))
+        s *= not frame.rpartition(".")[2].startswith("tool")
         w = np.linalg.norm(common[turning]) if turning.any() else _turned(updated, frame)
         std[at], std[turning] = np.hypot(std[at], np.hypot(w * t, f * s)), np.hypot(std[turning], w * f)
     rows = zip(changed, index, change.tolist(), std.tolist(), strict=True)
     moved += [Moved(name, free.dimensions[i], d, s) for name, i, d, s in rows]
-    return _known(moved, result, updated)
+    return _known(moved, changed, result, updated)
 
 
 def _known(
-    moved: Sequence[Moved], result: Calibration, updated: Calibration
+    moved: Sequence[Moved], changed: Sequence[str], result: Calibration, updated: Calibration
 ) -> tuple[tuple[Moved, ...], tuple[str, ...]]:
     """Return the movements that are better known than by the prior of released parameters, and the others' names."""
     widths = MULTIPLES[-1] * prior_widths(result, updated.problem)
     widest = dict(zip(updated.problem.parameters.free.names, widths.tolist(), strict=True))
-    known = tuple(each for each in moved if each.std < widest[each.name])
+    known = tuple(each for each in moved if each.std < (VAGUE if each.name in changed else 1) * widest[each.name])
     return known, tuple(each.name for each in moved if each not in known)
 
 

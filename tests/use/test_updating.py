@@ -16,6 +16,7 @@ from rpim_opt.basics.tables import csv_text
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.calibration.uncertainty import position_budget
 from rpim_opt.robot.chain import placed
+from rpim_opt.robot.kinematics import numeric_frame
 from rpim_opt.store import problems_folder
 from rpim_opt.store.result_file import digest
 from tests.calibration.mistakes import simulated_arm
@@ -276,6 +277,40 @@ def test_a_number_that_a_reset_base_makes_arbitrary_has_no_figure() -> None:
     for each in found.moved:
         assert each.std < 0.1
     assert "; the readings do not determine d2." in str(found)
+
+
+def test_changes_of_a_scara_are_as_certain_as_its_poses_show() -> None:
+    """Heights of its reflector and base are redundant: 98 mm times a rotation, or 3.3 mm of a link, were stated."""
+    robot = ro.load("scara").problem.robot
+    rng = np.random.default_rng(12)
+    arm = replace(robot, mdh=robot.mdh + rng.normal(size=robot.mdh.shape) * [5e-4, 4e-4, 5e-4, 4e-4, 0.0])
+    base, tool, other = map(
+        numeric_frame, ([0.9, -0.4, 0.2, 0, 0, 1.1], [0.03, 0, 0.05, 0.3, 0, 0.5], [0.2, 0.4, 0, 0, 0, 2])
+    )
+    turned = tool @ numeric_frame([1e-3, -5e-4, 8e-4, 2e-3, 0.0, 0.0])
+    bent = np.zeros((4, 5))
+    bent[0, 4], bent[1, :3] = -6e-4, (8e-4, 6e-4, 7e-4)
+
+    def poses(count: int, arm: ro.robot.Robot, base: np.ndarray, tool: np.ndarray) -> ro.Dataset:
+        q = rng.uniform([-2.2, -2.3, 0.02, -3], [2.2, 2.3, 0.18, 3], (count, 4))
+        noise = np.array([numeric_frame(3e-5 * rng.normal(size=6)) for _ in range(count)])
+        T = base @ ro.robot.forward_kinematics(arm, q) @ tool @ noise
+        return ro.Dataset.of(q, T, 3e-5, measurement="pose")
+
+    result = ro.calibrate(ro.problem_from(robot, poses(45, arm, base, tool)))
+    found = ro.use.update(result, poses(8, arm, base, turned))
+    moved = {each.name: each for each in found.moved}
+    for name, change in zip(("tool_x", "tool_y", "tool_z"), turned[:3, 3] - tool[:3, 3], strict=True):
+        assert moved[name].std < 5e-5
+        assert abs(moved[name].change - change) < 4 * moved[name].std
+    link = replace(arm, mdh=arm.mdh + bent)
+    found = ro.use.update(result, poses(8, link, other, tool), reset=("base_*",))
+    assert [cause.name for cause in found.changes] == ["link between joints 1 and 2"]
+    moved = {each.name: each for each in found.moved}
+    assert moved["a2"].std < 5e-5
+    for name, change in (("alpha2", 8e-4), ("a2", 6e-4)):
+        assert abs(moved[name].change - change) < 4 * moved[name].std
+    assert not {"theta1", "d1", "d2"} & {*moved}
 
 
 def test_what_an_update_does_not_explain_is_not_delivered_by_its_file_either(tmp_path) -> None:
