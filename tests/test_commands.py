@@ -553,6 +553,13 @@ def test_new_says_that_the_nominal_robot_does_not_explain_the_data_before_what_i
     assert re.search(r"\(the nominal robot does not explain the data, RMS error \d+ mm; optimum of the regist", guessed)
 
 
+def test_new_names_what_a_linear_axis_may_need(tmp_path: Path) -> None:
+    """A gantry's pitch error of 80 ppm was taken for scatter: no extension has it, and no text said so."""
+    scara = ro.store.problems_folder() / "scara"
+    made = ro.store.new_problem(tmp_path / "cell", scara / "robot.toml", scara / "identification.csv")
+    assert "# ratio3, if added: relative errors of linear axes" in (made.folder / "problem.toml").read_text()
+
+
 def test_new_says_that_a_robot_file_was_exported_from_a_calibration(made: Path, cell: Path, tmp_path: Path) -> None:
     """Its undetermined parameters would be taken for as well known as the others."""
     ro.use.export_files(ro.load_result(made / "results"), tmp_path / "arm.urdf", urdf=cell / "arm.urdf")

@@ -373,6 +373,7 @@ def _problem_text(
         touched=list(touched)[:2],
         base=None if base is None else _frame(base),
         mounting=known.get(robot.gravity.direction, list(robot.gravity.direction)),
+        linear=[f"ratio{i}" for i, kind in enumerate(robot.joint_types, start=1) if kind == "prismatic"],
         followers=[i for i in range(1, len(robot.mdh) + 1) if i - 1 not in robot.leading],
         identify=_patterns(names, len(robot.mdh)) + ["session_*"] * bool(apart),
     )
