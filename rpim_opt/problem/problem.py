@@ -427,7 +427,7 @@ class CalibrationProblem(RobotModel):
 
     def whitened_residual(self, x: Array) -> Array:
         """Return the residual at x (n,) [SI] in units of its noise, (m,), in the order of `linearize`'s equations."""
-        return self._whitened(self.contrasts(self.residual(x)[:, None]))[:, 0]
+        return self.whitened(self.contrasts(self.residual(x)[:, None]))[:, 0]
 
     # Linearization
 
@@ -435,7 +435,7 @@ class CalibrationProblem(RobotModel):
         """Return the whitened, scaled linear model around x (n,) [SI], its equations weighed by ``reweigh``, if any."""
         scale = self.parameters.free.scale
         residual, jacobian = self.slopes(x)
-        both = np.asfortranarray(self._whitened(self.contrasts(np.column_stack([jacobian * scale, residual]))))
+        both = np.asfortranarray(self.whitened(self.contrasts(np.column_stack([jacobian * scale, residual]))))
         A = both[:, :-1]
         z = x / scale
         kinds = [block.measurement for block in self.data.blocks]
@@ -501,7 +501,7 @@ class CalibrationProblem(RobotModel):
 
     # Noise
 
-    def _whitened(self, values: Array) -> Array:
+    def whitened(self, values: Array) -> Array:
         """Return values (m, c) of the equations in units of their noise."""
         whitened = np.empty_like(values)
         for index, inverse in self._inverses:

@@ -137,9 +137,9 @@ class Monitoring:
         for cause in self.wrong:
             what = f"Reading {cause.members[0]} is wrong by itself"
             if len(cause.members) > 1:
-                what = f"A reading of one configuration, {listed(cause.members)}, is wrong by itself"
+                what = f"The readings {cause.name} of one configuration are wrong together"
             figures = f"chi-squared falls by {three_digits(cause.gain)}, p-value {cause.p_value:.2g}"
-            lines.append(f"{what}: {figures}. Measure it again.")
+            lines.append(f"{what}: {figures}. Measure again.")
         if self.beyond:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
             lines.append(f"Outside the prediction interval of a new reading: {listed(named, between='; ')}.")
@@ -383,8 +383,8 @@ class _Explanations:
         moments = np.linspace(0, len(self.starts) - 1, min(len(self.starts), MOMENTS))
         self.moments = np.unique(moments.round().astype(int)).tolist()
         readings = list(recalibration.readings(problem, self.model))
-        self.equations = {cause.members: rows for cause, rows in readings}
-        causes = [*recalibration.candidates(framed, bent=bent), *(cause for cause, _ in readings)]
+        self.errors = {cause.members: (rows, errors) for cause, rows, errors in readings}
+        causes = [*recalibration.candidates(framed, bent=bent), *(cause for cause, *_ in readings)]
         self.priors = dict(zip(causes, recalibration.log_priors(causes).tolist(), strict=True))
 
     def columns(self, drift: Drift) -> Array:
@@ -434,9 +434,9 @@ class _Explanations:
         return log, drift._replace(cause=misfit.evidence(drift.cause, g, G), moved=moved)
 
     def _wrong(self, misfit: recalibration.Misfit, kept: Array, cause: recalibration.Cause) -> Explained:
-        rows = self.equations[cause.members]
-        g, G = misfit.projected(rows, kept[rows] * np.eye(len(rows)))
-        bayes = recalibration.log_bayes_factor(g, G, np.full(len(rows), recalibration.OUTLIER_WIDTH))
+        rows, errors = self.errors[cause.members]
+        g, G = misfit.projected(rows, kept[rows] * errors)
+        bayes = recalibration.log_bayes_factor(g, G, np.full(len(g), recalibration.OUTLIER_WIDTH))
         return self.priors[cause] + bayes, Drift(misfit.evidence(cause, g, G), int(self.when[rows[0]]), False, None)
 
 
@@ -508,5 +508,5 @@ def _explained(explanations: _Explanations, level: float, single: bool) -> _Expl
             more = of_reading
         log += more
         wrong.append(out.cause)
-        kept[explanations.equations[out.cause.members]] = 0.0
+        kept[explanations.errors[out.cause.members][0]] = 0.0  # all equations of its configuration
     return _Explanation(-np.inf, nearly, (), False)

@@ -13,7 +13,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import TINY, Array, rms, statistics
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.text import counted, joined, table, three_digits
+from rpim_opt.basics.text import counted, joined, listed, table, three_digits
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display, printed
 from rpim_opt.bayes.model_selection import deviations, named
@@ -345,7 +345,8 @@ def _in_turn(
     first: Weighed | None = None
     while True:
         updated = _recalibrated(result, problem, released, inflation, start)
-        causes, after = _weighed(result, updated.problem, updated.x, updated.formulation, released, bent)
+        laid = cast(CalibrationProblem, updated.problem)
+        causes, after = _weighed(result, laid, updated.x, updated.formulation, released, bent)
         first = first or (causes, after)
         # the most probable cause that chance does not explain, where a change is more probable than none
         changed = sum(cause.probability for cause in causes) > UNCHANGED
@@ -852,18 +853,33 @@ def _of_arms(problem: Source, zeros: Mapping[str, str], bent: bool) -> Iterator[
                 yield Cause(f"link between joints {joined(ends)}", "link", tuple(members))
 
 
-def readings(problem: Source, model: LinearModel) -> Iterator[tuple[Cause, np.ndarray]]:
-    """Yield every configuration as a cause, that was measured wrongly, with its equations."""
-    rows: dict[int, list[str]] = {}
-    for part in problem.rows():
-        for label, configuration in zip(part.data.label, part.data.configuration, strict=True):
-            rows.setdefault(int(configuration), []).append(label)
-    for number, labels in rows.items():
-        yield Cause(" or ".join(labels), "reading", tuple(labels)), np.flatnonzero(model.group == number)
+def readings(problem: CalibrationProblem, model: LinearModel) -> Iterator[tuple[Cause, np.ndarray, Array]]:
+    """Yield configurations, and rows of those with several, as causes: measured wrongly, all together or one alone.
+
+    With a configuration's equations (k,), and directions (k, j) of the error in standard deviations.
+    """
+    data, owners = problem.data, problem.owners
+    for number in np.unique(data.configuration):
+        equations, rows = np.flatnonzero(model.group == number), np.flatnonzero(data.configuration == number)
+        labels, every = [data.label[row] for row in rows], np.eye(len(equations))
+        yield Cause(listed(labels), "reading", tuple(labels)), equations, every
+        if len(rows) == 1 or problem.touches is not None:
+            continue
+        errors = np.zeros((len(owners), len(equations)))
+        errors[equations] = every
+        whitened = problem.whitened(errors)[equations]  # the noise of one is correlated with that of the others
+        for row, label in zip(rows, labels, strict=True):
+            own = np.linalg.qr(whitened[:, owners[equations] == row])[0]
+            yield Cause(label, "reading", (label,)), equations, own
 
 
 def _weighed(
-    result: Calibration, problem: Source, x: Array, prior: Formulation, released: Sequence[str], bent: bool = False
+    result: Calibration,
+    problem: CalibrationProblem,
+    x: Array,
+    prior: Formulation,
+    released: Sequence[str],
+    bent: bool = False,
 ) -> Weighed:
     """Return all causes with their evidence at x (n,) [SI], the most probable first, and how well all fits."""
     free = problem.parameters.free
@@ -874,9 +890,8 @@ def _weighed(
     for cause in candidates(problem, released, bent):
         index = [free.names.index(name) for name in cause.members]
         tried.append((cause, misfit.projected(slice(misfit.m, None), misfit.L[:, index]), width[index]))
-    for cause, equations in readings(problem, model):
-        values = np.eye(len(equations))
-        tried.append((cause, misfit.projected(equations, values), np.full(len(equations), OUTLIER_WIDTH)))
+    for cause, equations, errors in readings(problem, model):
+        tried.append((cause, misfit.projected(equations, errors), np.full(errors.shape[1], OUTLIER_WIDTH)))
     causes = [misfit.evidence(cause, *change) for cause, change, _ in tried]
     posterior = log_priors(causes) + [log_bayes_factor(*change, widths) for _, change, widths in tried]
     whole = float(np.logaddexp.reduce(posterior, initial=np.log(UNCHANGED)))
