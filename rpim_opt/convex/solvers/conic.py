@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from scipy.linalg import get_lapack_funcs, qr
 
 from rpim_opt.basics.arrays import Array
@@ -84,7 +85,6 @@ class Canonical:
 
     def __init__(self, objective: Any, constraints: Sequence[Any], variable: Any):
         from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
-        from scipy import sparse
 
         every = [objective, *constraints]
         present = {v.id: v for e in every for v in e.variables()}
@@ -102,7 +102,7 @@ class Canonical:
         self.zero = int(dims.zero)
         self.linear = int(dims.zero + dims.nonneg)
         self.offset = float(self._inverse[-1].get("offset", 0.0)) if isinstance(self._inverse[-1], dict) else 0.0
-        A = sparse.coo_array(data["A"])
+        A = scipy.sparse.coo_array(data["A"])
         sizes = [int(k) for k in dims.soc] + [int(k) * (int(k) + 1) // 2 for k in dims.psd]
         rest = len(data["b"]) - self.linear - sum(sizes)
         self.second_order = len(dims.soc)
@@ -112,10 +112,10 @@ class Canonical:
         self.row_scale[free] = 0.0
         self.b = np.where(free, 0.0, data["b"]) * self.row_scale + free
         self.q = data["c"] * self.column_scale
-        rows, columns = (sparse.diags_array(scale) for scale in (self.row_scale, self.column_scale))
+        rows, columns = (scipy.sparse.diags_array(scale) for scale in (self.row_scale, self.column_scale))
         P = data.get("P")
-        self.A: Any = sparse.csr_array(rows @ A @ columns)
-        self.P: Any = sparse.csc_array((self.size, self.size) if P is None else columns @ P @ columns)
+        self.A: Any = scipy.sparse.csr_array(rows @ A @ columns)
+        self.P: Any = scipy.sparse.csc_array((self.size, self.size) if P is None else columns @ P @ columns)
 
     @classmethod
     def box(cls, penalty: Quadratic | None, lower: Array, upper: Array) -> Canonical:
@@ -184,14 +184,12 @@ class Canonical:
 
         The other entries change by size y, and the rows are divided by ``size``.
         """
-        from scipy import sparse
-
         turned = np.eye(self.size)
         turned[np.ix_(self.at, self.at)] = M
-        T: Any = sparse.csr_array(turned)
+        T: Any = scipy.sparse.csr_array(turned)
         changed = copy(self)
-        changed.A, changed.b = sparse.csr_array(self.A) @ T, (self.b - self.A @ near) / size
-        changed.P = size**2 * (T.T @ sparse.csr_array(self.P) @ T)
+        changed.A, changed.b = scipy.sparse.csr_array(self.A) @ T, (self.b - self.A @ near) / size
+        changed.P = size**2 * (T.T @ scipy.sparse.csr_array(self.P) @ T)
         changed.q = size * (T.T @ (self.q + self.P @ near))
         return changed
 
@@ -257,7 +255,6 @@ class Clarabel:
     def renew(self) -> None:
         """Discard the solver: the next program has another sparsity pattern."""
         self._solver: Any = None
-        self._first: Attempt = ()
         self._numbers: dict[str, Array] = {}
 
     def solve(self, P: Any, q: Array, A: Any, b: Array) -> Any:
@@ -265,7 +262,7 @@ class Clarabel:
 
         P (its upper triangle) and A are `csc_matrix` with the same sparsity pattern in every call.
         """
-        solver = self._solver if self._first == self.attempts[0] else None
+        solver = self._solver
         solution = SimpleNamespace(status="")
         numbers = {"P": P.data.copy(), "q": q, "A": A.data.copy(), "b": b}
         for k, attempt in enumerate(self.attempts):
@@ -276,7 +273,7 @@ class Clarabel:
             else:
                 solver = self._made(P, q, A, b, attempt)
             if k == 0 and solver.is_data_update_allowed():
-                self._solver, self._numbers, self._first = solver, numbers, attempt
+                self._solver, self._numbers = solver, numbers
             solution = solver.solve()
             if str(solution.status) in SOLVED:
                 return solution
@@ -574,35 +571,28 @@ def _block(rows: np.ndarray, columns: np.ndarray) -> Entries:
 
 def _entries(M: Any, row: int, column: int, upper: bool = False) -> Entries:
     """Return those of a matrix, or of its upper triangle, from a row and column on."""
-    from scipy import sparse
-
-    M = sparse.coo_array(M)
+    M = scipy.sparse.coo_array(M)
     keep = M.row <= M.col if upper else slice(None)
     return M.row[keep] + row, M.col[keep] + column, M.data[keep]
 
 
 def _assembled(entries: list[Entries], shape: tuple[int, int]) -> tuple[Any, np.ndarray]:
     """Return a `csc_matrix` of entries at different places, and where in its data each of them is."""
-    from scipy import sparse
-
     rows, columns, numbers = (np.concatenate(each) for each in zip(*entries, strict=True))
     order = np.lexsort((rows, columns))
     starts = np.concatenate([[0], np.cumsum(np.bincount(columns, minlength=shape[1]))])
-    return sparse.csc_matrix((numbers[order], rows[order], starts), shape), np.argsort(order)
+    return scipy.sparse.csc_matrix((numbers[order], rows[order], starts), shape), np.argsort(order)
 
 
 def nearest(p: Canonical, z: Array) -> Array:
     """Return the point (n,) of a form's constraints that is nearest to z (n,); Unsolved where Clarabel finds none."""
-    from scipy import sparse
-
     n, N = len(z), p.size
-    link = sparse.coo_array((-np.ones(n + 1), (np.arange(n + 1), np.append(N, p.at))), (n + 1, N + 1))
-    A = sparse.csc_matrix(
-        sparse.vstack([sparse.hstack([sparse.coo_array(p.A), sparse.coo_array((len(p.b), 1))]), link])
-    )
+    link = scipy.sparse.coo_array((-np.ones(n + 1), (np.arange(n + 1), np.append(N, p.at))), (n + 1, N + 1))
+    stated = scipy.sparse.hstack([scipy.sparse.coo_array(p.A), scipy.sparse.coo_array((len(p.b), 1))])
+    A = scipy.sparse.csc_matrix(scipy.sparse.vstack([stated, link]))
     bound = np.concatenate([p.b, [0.0], -z])  # (t, x - z) in a second-order cone; minimize t
     cone = import_module("clarabel").SecondOrderConeT(n + 1)
-    flat = sparse.csc_matrix((N + 1, N + 1))
+    flat = scipy.sparse.csc_matrix((N + 1, N + 1))
     clarabel = Clarabel([*p.clarabel_cones, cone], (*ATTEMPTS, LOOSE))
     solution = clarabel.solve(flat, np.append(np.zeros(N), 1.0), A, bound)
     return np.array(solution.x)[p.at]
