@@ -105,11 +105,6 @@ class Arguments(Identified):
         return cp.reshape(flat @ self.z, (count, 3), order="C") + prediction.position
 
 
-def whole(p: Arguments) -> Parameters:
-    """Return all parameters of the problem; without a problem, those of the arguments."""
-    return p if p.problem is None else p.problem.parameters
-
-
 def problem_of(p: Arguments) -> CalibrationProblem:
     """Return the problem that predicts positions for some parameters; InputError if there is none."""
     if p.problem is None:

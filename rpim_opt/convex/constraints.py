@@ -15,7 +15,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import shortened
 from rpim_opt.basics.units import UNITS, display
-from rpim_opt.convex.arguments import Arguments, arguments_of, every_movement, places, problem_of, whole
+from rpim_opt.convex.arguments import Arguments, arguments_of, every_movement, places, problem_of
 from rpim_opt.convex.expressions import cp
 from rpim_opt.problem.workspace import bounding
 from rpim_opt.robot.parameters import Parameters
@@ -480,7 +480,8 @@ class Parsed:
 
         Parameters that are not identified have their nominal values.
         """
-        table, unit = whole(p), self.demanded.unit
+        table = p if p.problem is None else p.problem.parameters
+        unit = self.demanded.unit
         patterns = [name for name in found.names if name not in table.names]
         matched = [""]
         if patterns:

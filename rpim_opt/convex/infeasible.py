@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,13 +13,8 @@ from rpim_opt.convex.structure import Structure
 
 LEAST = 1e-6
 """Slacks below this are within the solver's accuracy."""
-
-
-class Condition(NamedTuple):
-    """CVXPY constraints of z, by a name that their user knows."""
-
-    name: str
-    demands: tuple[Any, ...]
+Conditions = list[tuple[str, list[Any]]]
+"""CVXPY constraints of z, by names that their user knows."""
 
 
 def conflict(structure: Structure) -> Conflict | None:
@@ -55,26 +50,26 @@ def conflict(structure: Structure) -> Conflict | None:
     )
     bounds = {parameters.names[i]: by for i, by in boxes.items()}
     statements = {name: by for name, (by, _) in stated.items()}
-    return Conflict(bounds, tuple(condition.name for condition in left), statements, loosen)
+    return Conflict(bounds, tuple(name for name, _ in left), statements, loosen)
 
 
-def _demands(conditions: list[Condition]) -> list[Any]:
-    return [demand for condition in conditions for demand in condition.demands]
+def _demands(conditions: Conditions) -> list[Any]:
+    return [demand for _, demands in conditions for demand in demands]
 
 
-def _possible(conditions: list[Condition]) -> bool:
+def _possible(conditions: Conditions) -> bool:
     """Whether all can be met at once."""
     problem = cp.Problem(cp.Minimize(0), _demands(conditions))
     return minimized(problem) or problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
 
 
-def _conditions(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any = 0) -> list[Condition]:
+def _conditions(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any = 0) -> Conditions:
     """Return the conditions of every constraint function, bound by bound.
 
     They are loosened by slacks of ``boxes`` [scales] and of ``statements`` in words [scales of each].
     """
     parameters, stated = structure.parameters, structure.formulation
-    made: list[Condition] = []
+    made: Conditions = []
     count = 0
     for k, function in enumerate(stated.constraints):
         if isinstance(function, Box):
@@ -83,17 +78,17 @@ def _conditions(structure: Structure, z: cp.Variable, boxes: Any = 0, statements
                 for i in np.flatnonzero(np.isfinite(side)):
                     bound = as_text(side[i] * parameters.scale[i], parameters.dimensions[i])
                     demand = z[i] >= side[i] - more[i] if sign == ">" else z[i] <= side[i] + more[i]
-                    made.append(Condition(f"{parameters.names[i]} {sign}= {bound} ({function.name})", (demand,)))
+                    made.append((f"{parameters.names[i]} {sign}= {bound} ({function.name})", [demand]))
         elif isinstance(function, Parsed):
             by = None if isinstance(statements, int) else function.scale(parameters) * statements[count]
-            made.append(Condition(function.name, tuple(function.loosened(z, parameters, by))))
+            made.append((function.name, function.loosened(z, parameters, by)))
             count += 1
         else:
             own = structure.expressions
             demands = [substituted(constraint, {id(own.z): z}) for constraint in own.constraints[k]]
             name = name_of(function, k)
             several = len(demands) > 1
-            made += [Condition(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
+            made += [(f"{name} ({i + 1})" if several else name, [demand]) for i, demand in enumerate(demands)]
     return made
 
 

@@ -16,7 +16,7 @@ from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import Brief
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.convex.constraints import Box, box_sides
-from rpim_opt.convex.expressions import OPTIMAL, cp, substituted
+from rpim_opt.convex.expressions import OPTIMAL, cp, norms, substituted
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
 from rpim_opt.convex.robust_loss import Inliers, inliers_of
@@ -320,10 +320,12 @@ class Program(Brief):
         A, b, weight = data
         z, r = cp.Variable(shape.n, name="z"), cp.Variable(shape.equations, name="r")
         instead = {id(expressions.z): z, id(expressions.r): r}
+        if shape.over_norms:
+            instead[id(expressions.loss.variable)] = norms(r, shape.groups)
         groups = [[substituted(constraint, instead) for constraint in group] for group in groups]
         every = [r == A @ z - b]
         every += [constraint for group in groups for constraint in group]
-        total = substituted(shape.of_r(loss), instead) + self.model.offset
+        total = substituted(loss, instead) + self.model.offset
         if penalty is not None:
             price = substituted(penalty, instead)
             if price.parameters():  # a product of two parameters is not DPP

@@ -40,11 +40,7 @@ class Quadratic:
 
     def times(self, v: Array) -> Array:
         """Return L v, for v (n,) or a matrix (n, j)."""
-        if not self.diagonal:
-            return self.L @ v
-        if v.ndim == 1:
-            return self.L * v
-        return self.L[:, None] * v
+        return (self.L * v.T).T if self.diagonal else self.L @ v
 
     @property
     def size(self) -> float:

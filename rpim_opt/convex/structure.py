@@ -188,11 +188,6 @@ class Structure:
         """Whether the loss gets the configurations' norms."""
         return self.formulation.loss_over == "configuration"
 
-    def of_r(self, stated: Any) -> Any:
-        """Return an expression of the loss's argument as one of r."""
-        argument, r = self.expressions.loss.variable, self.expressions.r
-        return stated if argument is r else substituted(stated, {id(argument): norms(r, self.groups)})
-
     @cached_property
     def on_squares(self) -> Structure:
         """The same penalty and constraints with the sum of squares of the equations as the loss."""
