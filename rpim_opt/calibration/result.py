@@ -10,10 +10,8 @@ from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import html_table
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.calibration import words
-from rpim_opt.calibration.outcome import Iteration, Outcome, Prediction
+from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.verdict import Verdict, judge, likely_causes, mistakes
-
-__all__ = ["Calibration", "Iteration", "Prediction"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -139,8 +139,6 @@ class RobotModel(Tabled):
         former = {name for curve in self.robot.model.curves for name in transmission(curve).names(curve.joint)}
         p = self.parameters.take(np.flatnonzero([name not in former for name in self.parameters.names]))
         bare = replace(self, robots=replace(self.robot, model=Model(own)), parameters=p, repeatability=None)
-        if not curves:
-            return bare
         return bare.with_model(Model([transmission(curve) for curve in curves]))
 
     def frozen(self) -> Self:

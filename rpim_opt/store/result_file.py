@@ -24,7 +24,8 @@ from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import ActiveBound, ShadowPrice
 from rpim_opt.calibration.held_out import sets
 from rpim_opt.calibration.identify import calibrate, mapped_as
-from rpim_opt.calibration.result import Calibration, Iteration
+from rpim_opt.calibration.loop import Iteration
+from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex import constraints
 from rpim_opt.convex.expressions import LARGEST, NORM1, NORM2, SQUARES, SUM
 from rpim_opt.convex.formulation import Formulation, huber, unavailable
