@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -525,12 +525,11 @@ def repeatability_bounds(result: Calibration, region: Region, q: Array, confiden
     return bounds[0], bounds[1]
 
 
-def _unmodelled(result: Calibration, region: Region) -> list[str]:
-    """Return sentences on a model that does not fit, and on joint ranges of the region that were not measured."""
-    lines: list[str] = []
+def _unmodelled(result: Calibration, region: Region) -> Iterator[str]:
+    """Say that the model does not fit, and which joint ranges of the region were not measured."""
     fit = judged(result)
     if fit is not None and fit.alarming:
-        lines.append(f"Missing: a model that fits. {fit}")
+        yield f"Missing: a model that fits. {fit}"
     corners = Dataset.of(region.limits.T.copy(), np.zeros((2, 3)), 1.0)
     named: list[str] = []
     for joint in result.outside(corners).joints:
@@ -539,5 +538,4 @@ def _unmodelled(result: Calibration, region: Region) -> list[str]:
         named.append(f"joint {result.problem.robot.joint(joint - 1)} from {low:.4g} to {high:.4g} {unit}")
     if named:
         where = f"{joined(named)}, which is part of the region: no measurement checked the model there."
-        lines.append(f"Missing: measurements with {where}")
-    return lines
+        yield f"Missing: measurements with {where}"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, choices, in_file
 from rpim_opt.basics.text import Tabled
 from rpim_opt.basics.units import SMALLEST, display, fits, quantities, split_unit
 from rpim_opt.robot.extensions import moment_names
@@ -351,7 +351,7 @@ def overlay(
     dimensions = np.array(parameters.dimensions)
     accepted = {stem: tuple(sorted(set(dimensions[index].tolist()))) for stem, index in members.items()}
     result = values.copy()
-    try:
+    with in_file(file):
         sizes = quantities(table, accepted, where)
         for (stem, dimension), value in sorted(sizes.items(), key=lambda item: order.index(item[0][0])):
             if not (value >= SMALLEST or signed):
@@ -359,8 +359,6 @@ def overlay(
                 raise InputError(f"{where}, key {stem}", f"{value:g}", found)
             index = np.array(members[stem])
             result[index[dimensions[index] == dimension]] = value
-    except InputError as error:
-        raise error.within(file) from None
     return result
 
 

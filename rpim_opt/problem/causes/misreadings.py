@@ -408,18 +408,16 @@ def _of_rows(points: Points) -> Iterator[Misreading]:
     for by, low, back in SLIPPED if points.q.ndim > 2 and points.q.shape[1] > 1 else ():
         what = f"the joint values of the second point one row too {low} in the table"
         yield Misreading(what, f"move their columns one row {back}", partial(_slipped, np.s_[:, 1], by))
+
+    def reordered(order: np.ndarray, points: Points) -> Points:
+        return replace(points, q=points.q[order])
+
+    what = "the rows of joint values in the reverse order"
+    yield Misreading(what, "reverse the order of one of the two", partial(reordered, np.arange(count)[::-1]))
     by_text = np.array(sorted(range(count), key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
-    for what, how, order in (
-        (
-            "the rows of joint values in the reverse order",
-            "reverse the order of one of the two",
-            np.arange(count)[::-1],
-        ),
-        ("measured values sorted as text (1, 10, 11, 2)", remedy, by_text),
-        ("joint values sorted as text (1, 10, 11, 2)", remedy, np.argsort(by_text)),
-    ):
-        yield Misreading(what, how, lambda points, order=order: replace(points, q=points.q[order]))
+    for which, order in (("measured", by_text), ("joint", np.argsort(by_text))):
+        yield Misreading(f"{which} values sorted as text (1, 10, 11, 2)", remedy, partial(reordered, order))
 
 
 def _apart(points: Points) -> Iterator[Misreading]:

@@ -67,14 +67,12 @@ def first(*explanations: Iterable[str]) -> list[str]:
     return next((sentences for sentences in map(list, explanations) if sentences), [])
 
 
-def hardly_moved(robot: Robot, measured: Array) -> list[str]:
-    """Return which joints moved less than `LEAST_TRAVEL` in measured ranges (2, dof), and how far, as text."""
-    lines = []
+def hardly_moved(robot: Robot, measured: Array) -> Iterator[str]:
+    """Yield which joints moved less than `LEAST_TRAVEL` in measured ranges (2, dof), and how far, as text."""
     for i, (travel, dimension) in enumerate(zip(np.ptp(measured, axis=0), robot.joint_dimensions, strict=True)):
         if travel < LEAST_TRAVEL[robot.joint_types[robot.leading[i]]]:
             unit, si = display(dimension)
-            lines.append(f"joint {robot.joint(i)} moves only {travel / si:.2f} {unit}")
-    return lines
+            yield f"joint {robot.joint(i)} moves only {travel / si:.2f} {unit}"
 
 
 def moved_one_by_one(robot: Robot, q: Array) -> bool:

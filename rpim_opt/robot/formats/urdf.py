@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
@@ -96,7 +96,7 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
         limits=np.array([urdf.joints[name].limits for name in way.names]),
         source=f"{Path(path).name}, {way.steps[0].start} to {way.steps[-1].end}",
         gravity=_masses(urdf, way, table, G).mounted("floor", (T_top_base @ T_base)[:3, :3]),
-        model=Model(_displacements(way, table, G) if origins else ()),
+        model=Model(tuple(_displacements(way, table, G)) if origins else ()),
         joint_names=(*[""] * origins, *(joint.name for joint in way.joints)),
     )
     for name, i in zip(way.names, robot.leading, strict=True):
@@ -223,9 +223,8 @@ def _taker(part: Sequence[_Step]) -> int:
     return 0 if part and part[0].up and not part[-1].joint.kind else len(part) - 1
 
 
-def _displacements(way: _Way, table: Array, G: Array) -> list[Term]:
-    """Return the terms of the origins of all joints that move, and of a fixed one where an end has no other."""
-    terms = []
+def _displacements(way: _Way, table: Array, G: Array) -> Iterator[Term]:
+    """Yield the terms of the origins of all joints that move, and of a fixed one where an end has no other."""
     for row, part in enumerate(way.parts, start=1):
         F = numeric_link(beta=-table[row - 1, 4]) @ G[row - 1]
         taker = _taker(part)
@@ -235,8 +234,7 @@ def _displacements(way: _Way, table: Array, G: Array) -> list[Term]:
             if step.joint.kind or i == taker:
                 origins.append(Origin(step.joint.prefix, F if step.up else before, step.up))
         if origins:
-            terms.append(origins_term(RowOrigins(row, tuple(origins))))
-    return terms
+            yield origins_term(RowOrigins(row, tuple(origins)))
 
 
 def _product(transforms: Sequence[np.ndarray]) -> Array:
