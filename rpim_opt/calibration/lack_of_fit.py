@@ -20,7 +20,7 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.verdict import against_gravity, upward_sentence
 from rpim_opt.problem.noise import UNITS, Repeatability, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.row_functions import about_means, measured_torques, repeated
+from rpim_opt.problem.row_functions import measured_torques, repeated
 
 FEWEST = 6  # least number of redundant equations, or repetitions, for a judgement
 CORRELATED = 4.0  # z-score from which residuals are called autocorrelated
@@ -280,7 +280,8 @@ def _repeated(problem: CalibrationProblem, x: Array, dimension: str) -> tuple[fl
         r = residual[:, [d == dimension for d in block.measurement.components.values()]]
         number = repeated(block)
         again = len(r) - len(np.unique(number))
-        squares += float(np.sum(about_means(r, number) ** 2))
+        means = np.array([np.bincount(number, column) for column in r.T]).T / np.bincount(number)[:, None]
+        squares += float(np.sum((r - means[number]) ** 2))
         rows += again
         freedom += again * r.shape[1]
     if freedom < FEWEST:

@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
-import numpy as np
-
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import joined
 from rpim_opt.basics.units import fits
 from rpim_opt.convex.expressions import cp
 from rpim_opt.problem.problem import CalibrationProblem, Identified
-from rpim_opt.problem.workspace import Predicted, markers, moved, predicted
+from rpim_opt.problem.workspace import markers, predicted
 from rpim_opt.robot.parameters import Parameters
 
 
@@ -112,17 +110,6 @@ def problem_of(p: Arguments) -> CalibrationProblem:
         raise InputError("positions", found, "parameters of a problem's linear model (`CalibrationProblem`)")
     p.nonlinear.append("positions")
     return p.problem
-
-
-def every_movement(p: Arguments, q: Array) -> Predicted:
-    """Return displacements (M, 3) [m] of every reflector by the robot's parameters, and their slopes (M, 3, n) by z.
-
-    Deviations of frames (base, reflector) are left out: they are no property of the robot.
-    """
-    problem = problem_of(p)
-    movements = [moved(problem, q, marker, at=p.at) for marker in markers(problem)]
-    slope = np.concatenate([each.slope for each in movements])
-    return Predicted(np.concatenate([each.position for each in movements]), slope * p.scale)
 
 
 def arguments_of(z: Any, parameters: Parameters) -> Arguments:

@@ -15,9 +15,9 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import shortened
 from rpim_opt.basics.units import UNITS, display
-from rpim_opt.convex.arguments import Arguments, arguments_of, every_movement, places, problem_of
+from rpim_opt.convex.arguments import Arguments, arguments_of, places, problem_of
 from rpim_opt.convex.expressions import cp
-from rpim_opt.problem.workspace import bounding
+from rpim_opt.problem.workspace import bounding, markers, moved
 from rpim_opt.robot.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -290,7 +290,7 @@ def matching(parameters: Parameters, patterns: Sequence[str], what: str) -> np.n
 
 
 def _grouped(parameters: Parameters, key: Callable[[str], str]) -> list[Array]:
-    keys = [key(name) for name in parameters.names]
+    keys = [key(name) if name[-1].isdigit() else name.split("_")[0] for name in parameters.names]
     return [np.eye(len(keys))[[i for i, k in enumerate(keys) if k == one]] for one in dict.fromkeys(keys)]
 
 
@@ -304,9 +304,7 @@ def by_link(parameters: Parameters) -> list[Array]:
     >>> [len(D) for D in ro.constraints.by_link(parameters)]  # six links, base, tool
     [4, 5, 4, 4, 4, 4, 6, 3]
     """
-    return _grouped(
-        parameters, lambda name: re.sub(r"^[a-z_]+?(\d+)$", r"\1", name) if name[-1].isdigit() else name.split("_")[0]
-    )
+    return _grouped(parameters, lambda name: re.sub(r"^[a-z_]+?(\d+)$", r"\1", name))
 
 
 def by_kind(parameters: Parameters) -> list[Array]:
@@ -317,7 +315,7 @@ def by_kind(parameters: Parameters) -> list[Array]:
     >>> [len(D) for D in ro.constraints.by_kind(parameters)]  # alpha, a, theta, d, beta, base, tool
     [6, 6, 6, 6, 1, 6, 3]
     """
-    return _grouped(parameters, lambda name: name.rstrip("0123456789") if name[-1].isdigit() else name.split("_")[0])
+    return _grouped(parameters, lambda name: name.rstrip("0123456789"))
 
 
 def differences(*patterns: str) -> Callable[[Parameters], list[Array]]:
@@ -460,12 +458,15 @@ class Parsed:
                 if numbers is None or known[name].is_box:
                     numbers = bounding(problem_of(p), numbers, p.at)
                 q.append(numbers)
-            movement = every_movement(p, np.concatenate(q))
-            size = np.linalg.norm(movement.slope, axis=(1, 2))
+            problem = problem_of(p)  # deviations of frames are no property of the robot: `moved` leaves them out
+            movements = [moved(problem, np.concatenate(q), marker, at=p.at) for marker in markers(problem)]
+            slope = np.concatenate([each.slope for each in movements]) * p.scale
+            position = np.concatenate([each.position for each in movements])
+            size = np.linalg.norm(slope, axis=(1, 2))
             moving = size > 0
             if not moving.any():
                 raise self._wrong("no identified parameter that moves the tool", "parameters of the robot")
-            return movement.slope[moving], movement.position[moving], size[moving]
+            return slope[moving], position[moving], size[moving]
         rows = [row for each in self.demanded.sums for row in self._rows(each, p)]
         E, f = np.array([[row] for row, _ in rows]), np.array([[constant] for _, constant in rows])
         size = np.linalg.norm(E[:, 0], axis=1)

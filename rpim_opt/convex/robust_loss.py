@@ -76,9 +76,8 @@ class Inliers:
 def kept_equations(model: LinearModel, keep: np.ndarray, factor: float) -> LinearModel:
     """Return some of a model's equations (m,), multiplied by the root of a factor."""
     A, b = np.compress(keep, model.A.T, axis=1).T, model.b[keep]  # column-major, as LAPACK requires
-    if factor != 1:
-        A *= np.sqrt(factor)
-        b *= np.sqrt(factor)
+    A *= np.sqrt(factor)
+    b *= np.sqrt(factor)
     return replace(model, A=A, b=b, group=model.group[keep], factor=factor)
 
 

@@ -588,9 +588,8 @@ class CalibrationProblem(RobotModel):
         """
         joints = {}
         for name, robot in self.arms.items():
-            for i, kind in enumerate(robot.joint_types):
+            for i, (kind, zero) in enumerate(zip(robot.joint_types, robot.zeros, strict=True)):
                 if kind == "revolute" or sliding:
-                    zero = f"{'theta' if kind == 'revolute' else 'd'}{i + 1}"
                     joints |= {zero: i, f"{name}.{zero}": i}
         # a joint number of several robots: each row has derivatives by its own robot's
         return self._slopes_by(joints, max(len(robot.mdh) for robot in self.arms.values()), at)

@@ -313,10 +313,3 @@ def repeated(block: Block) -> np.ndarray:
     seen = [block.columns[name][:, None] for name in block.measurement.depends_on if name in block.columns]
     same = np.hstack([block.q.reshape(len(block.row), -1), *seen]).round(7)
     return np.unique(same, axis=0, return_inverse=True)[1].ravel()  # a column in NumPy 2.0
-
-
-def about_means(values: Array, number: np.ndarray) -> Array:
-    """Return values (N, k) about the mean of those of the same number (N,)."""
-    sums = np.zeros((number.max(initial=-1) + 1, values.shape[1]))
-    np.add.at(sums, number, values)
-    return values - (sums / np.bincount(number)[:, None])[number]

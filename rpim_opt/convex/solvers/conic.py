@@ -162,8 +162,6 @@ class Canonical:
         """A matrix (p, N) with root'root = P."""
         values, vectors = np.linalg.eigh(self.dense[1])
         curved = values > CURVED * max(values[-1], 0.0)
-        if not values[-1] > 0:
-            return np.zeros((0, self.size))
         return (np.sqrt(np.where(curved, values, 0.0)) * vectors).T[curved]
 
     @cached_property
