@@ -23,7 +23,7 @@ from rpim_opt.convex.robust_loss import Inliers, inliers_of
 from rpim_opt.convex.solvers.conic import FEASIBLE, Damping, Point, Unsolved, nearest, triangular_solution
 from rpim_opt.convex.solvers.separable import Rows
 from rpim_opt.convex.solvers.solve import WarmStart, minimum
-from rpim_opt.convex.structure import TIGHT, Structure, structure
+from rpim_opt.convex.structure import INVARIANT, TIGHT, Structure
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, reduced_rows
 
 ACTIVE = 1e-7
@@ -182,10 +182,19 @@ class Program(Brief):
     @cached_property
     def squared(self) -> LinearModel:
         """The equations whose squares a quadratic loss sums, |L (A z - b) - c|^2; InputError for another loss."""
-        form = self.loss_form
+        form, model = self.loss_form, self.model
         if form is None:
             raise InputError(f"formulation '{self.formulation.name}'", "a loss that is not quadratic", "a squared loss")
-        return _squared(self.model, form)
+        if form.diagonal and (form.L == 1).all() and not form.c.any() and form.constant == 0:
+            return model
+        A, b = form.times(model.A), form.times(model.b) + form.c
+        group = model.group
+        if form.diagonal:
+            counts = form.L > 0  # equations without weight are none
+            A, b, group = A[counts], b[counts], group[counts]
+        else:
+            group = np.zeros(len(b), dtype=int)  # its rows mix configurations
+        return replace(model, A=A, b=b, group=group, offset=model.offset + form.constant, factor=form.size)
 
     @cached_property
     def ridge(self) -> Ridge:
@@ -586,20 +595,6 @@ class Program(Brief):
         return NoSolutionFound(self.formulation.name, weight, status, contradiction, text)
 
 
-def _squared(model: LinearModel, form: Quadratic) -> LinearModel:
-    """Return the equations whose squares a quadratic of the residual sums."""
-    if form.diagonal and (form.L == 1).all() and not form.c.any() and form.constant == 0:
-        return model
-    A, b = form.times(model.A), form.times(model.b) + form.c
-    group = model.group
-    if form.diagonal:
-        counts = form.L > 0  # equations without weight are none
-        A, b, group = A[counts], b[counts], group[counts]
-    else:
-        group = np.zeros(len(b), dtype=int)  # its rows mix configurations
-    return replace(model, A=A, b=b, group=group, offset=model.offset + form.constant, factor=form.size)
-
-
 def _sides(lower: Array, upper: Array) -> np.ndarray:
     """Return the components that the rows of a box bound: fixed ones, lower and upper bounds."""
     return np.concatenate([np.flatnonzero(side) for side in box_sides(lower, upper)])
@@ -621,5 +616,14 @@ def pose(
     (True, 2)
     """
     formulation = formulation_of(formulation)
-    made = structure(formulation, model, forms)
+    m, n = model.A.shape
+    if formulation.solvable:
+        by_length = formulation.loss in INVARIANT and formulation.loss_over == "equation"
+        if model.stands_for is not None and not by_length:
+            found = "equations in blocks, of which only the QR factor is kept"
+            accepted = "cp.sum_squares or cp.norm2 of the equations as the loss"
+            raise InputError(f"formulation '{formulation.name}'", found, accepted)
+        if by_length:
+            m = n + 1
+    made = Structure(formulation, model.parameters, m, model.members[0], forms)
     return Program(formulation, model, made, WarmStart(made))

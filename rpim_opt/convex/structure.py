@@ -44,7 +44,6 @@ from rpim_opt.convex.quadratic import Quadratic, identity, quadratic
 from rpim_opt.convex.robust_loss import QuadraticModel, separable
 from rpim_opt.convex.solvers.conic import Canonical
 from rpim_opt.convex.solvers.separable import Loss
-from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
 
 INVARIANT = (SQUARES, NORM2)
@@ -357,22 +356,6 @@ class Structure:
             own.save_value(z)
             with np.errstate(all="ignore"):
                 return not any(np.any(limit.violation() > 0) for limit in self.expressions.flat)
-
-
-def structure(
-    formulation: Formulation, model: LinearModel, forms: Sequence[Quadratic | None] | None = None
-) -> Structure:
-    """Return the structure of a formulation for the shape of a model; arguments as for `pose`."""
-    m, n = model.A.shape
-    if formulation.solvable:
-        by_length = formulation.loss in INVARIANT and formulation.loss_over == "equation"
-        if model.stands_for is not None and not by_length:
-            found = "equations in blocks, of which only the QR factor is kept"
-            accepted = "cp.sum_squares or cp.norm2 of the equations as the loss"
-            raise InputError(f"formulation '{formulation.name}'", found, accepted)
-        if by_length:
-            m = n + 1
-    return Structure(formulation, model.parameters, m, model.members[0], forms)
 
 
 def in_blocks(formulation: Formulation) -> tuple[Formulation, QuadraticModel | None]:
