@@ -205,10 +205,9 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
     for (i, j), size, side in product(pairwise(np.flatnonzero(turning)), (0.5, 1.0), (1.0, -1.0)):
         M = eye.copy()
         M[np.ix_([i, j], [i, j])] = size * np.array([[1, 1], [side, -side]])
-        what = (
-            f"columns q{i + 1} and q{j + 1} that are sum and difference of joints {robot.joint(i)} and {robot.joint(j)}"
-        )
-        yield _joints(f"{what} (a differential)", coupling(robot.joint_map @ M), M)
+        both = f"joints {robot.joint(i)} and {robot.joint(j)} (a differential)"
+        what = f"columns q{i + 1} and q{j + 1} that are sum and difference of {both}"
+        yield _joints(what, coupling(robot.joint_map @ M), M)
     own = set(zip(robot.leading, range(robot.dof), strict=True))
     coupled = product(range(len(robot.mdh)), range(robot.dof)) if len(robot.mdh) > robot.dof else ()
     for (i, j), factor in product(sorted({*coupled} - own), (-1, 0, 1)):

@@ -304,10 +304,8 @@ def _other_place(points: Points, first: Fit, second: Fit, sessions: bool) -> tup
         backs: Any = np.linalg.inv(np.stack([first.base, second.base]))
         joint, places = 1, transformed(backs, second.modelled[:, None])
         far = float(np.linalg.norm(places[:, 1] - places[:, 0], axis=1).mean())
-        remedy = (
-            "name both parts in a column `session` of the raw table (rpim-opt new registers each), or calibrate one "
-        )
-        remedy += "and add the other to its result with `update --reset 'base_*'`"
+        remedy = "name both parts in a column `session` of the raw table (rpim-opt new registers each), or calibrate "
+        remedy += "one and add the other to its result with `update --reset 'base_*'`"
         if sessions:  # of one place, unless they are said to be apart
             remedy = "if it did between sessions, identify `session_*` in place of `base_*`, "
             remedy += "with session_mm = 1000 and session_mrad = 1000 in [scale]"
