@@ -558,7 +558,9 @@ class Program(Brief):
         if not isinstance(solver, str) or solver.upper() not in cp.installed_solvers():
             installed = ", ".join(cp.installed_solvers())
             raise InputError("solver", f"{solver!r}", f"an installed solver: {installed}")
-        problem, z, groups = self._written((*self.rows, weight), self.structure.expressions.stated, damping)
+        own = self.structure.expressions
+        stated = own.loss.expression, own.penalty_of_z, own.constraints
+        problem, z, groups = self._written((*self.rows, weight), stated, damping)
         for variable in problem.variables():
             variable.save_value(None)
         with warnings.catch_warnings():

@@ -56,8 +56,8 @@ class Expressions:
     """Expressions that a formulation's functions return, with private copies of the user's parameters and variables.
 
     ``loss`` and ``penalty`` are expressions of their arguments (residuals or norms, z or norms of groups),
-    ``penalty_of_z`` and ``constraints``, one list per function, of z; ``stated`` are loss, penalty and constraints,
-    ``live`` the same with the user's own parameters.
+    ``penalty_of_z`` and ``constraints``, one list per function, of z; ``live`` are loss, penalty and constraints with
+    the user's own parameters.
     """
 
     def __init__(self, formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray):
@@ -109,7 +109,6 @@ class Expressions:
         self.constraints = [[frozen(each) for each in group] for group in live]
         self.flat = [constraint for group in self.constraints for constraint in group]
         self.own = {variable.id for variable in frozen.own}
-        self.stated: tuple[Any, ...] = (self.loss.expression, self.penalty_of_z, self.constraints)
         self.live: tuple[Any, ...] = (live_loss, live_penalty, live)
         self.predicts = bool(known.nonlinear)
 
@@ -190,31 +189,29 @@ class Structure:
     @cached_property
     def on_squares(self) -> Structure:
         """The same penalty and constraints with the sum of squares of the equations as the loss."""
-        made = self._changed("loss_form", "loss")
+        made = self._changed(replace(self.formulation, loss=SQUARES, loss_over="equation"), "loss_form", "loss")
         if made._called is not None:
             own = made._called
             own.r = cp.Variable(self.n + 1, name="r")
             own.loss = Term(cp.sum_squares(own.r), own.r)
-            own.stated = (own.loss.expression, *own.stated[1:])
             own.live = (own.loss.expression, *own.live[1:])
-        made.formulation = replace(self.formulation, loss=SQUARES, loss_over="equation")
         made.equations = self.n + 1
         return made
 
     @cached_property
     def without_penalty(self) -> Structure:
         """The same loss and constraints without the penalty."""
-        made = self._changed("penalty_form", "canonical")
+        made = self._changed(replace(self.formulation, penalty=None), "penalty_form", "canonical")
         if made._called is not None:
             own = made._called
             own.penalty = own.penalty_of_z = None
-            own.stated, own.live = ((loss, None, groups) for loss, _, groups in (own.stated, own.live))
-        made.formulation = replace(self.formulation, penalty=None)
+            own.live = (own.live[0], None, own.live[2])
         return made
 
-    def _changed(self, *properties: str) -> Structure:
+    def _changed(self, formulation: Formulation, *properties: str) -> Structure:
         """Return a copy for another formulation, whose functions that stay are not called again."""
         made = copy.copy(self)
+        made.formulation = formulation
         for name in (*properties, "joint", "inner", "_over_own", "on_squares", "without_penalty"):
             vars(made).pop(name, None)
         made._called = copy.copy(self._called)
