@@ -8,7 +8,7 @@ Sun and Saunders 2014, SIAM J. Optim. 24:1420).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -121,7 +121,7 @@ class Newton:
     """One search for the minimum of loss(A z - b) + damping(z) + weight penalty(z) subject to constraints.
 
     ``small`` is the program of squares, penalty and constraints; ``jump`` the largest jump of the loss's slope, 0 where
-    it is smooth.
+    it is smooth; ``x`` (N,) the point of the canonical form, at first the start.
     """
 
     loss: Loss
@@ -131,8 +131,8 @@ class Newton:
     weight: float
     damping: Damping | None
     jump: float
+    x: Array
     steps: int = 0
-    x: Array = field(default_factory=lambda: np.zeros(0))
     point: Point | None = None
 
     # --- the loss ----------------------------------------------------------------------------------------------------
@@ -172,17 +172,18 @@ class Newton:
             H += (turned * (along - across)[curved, None]).T @ turned
         return U.T @ (wide * r), H
 
-    def _residual(self, z: Array) -> Array:
-        return self.rows.A @ z - self.rows.b
+    def _residual(self, x: Array) -> Array:
+        return self.rows.A @ x[self.canonical.at] - self.rows.b
 
     def _total(self, r: Array) -> float:
         return float(self.loss.values(self.rows.entries(r)).sum())
 
-    def _others(self, z: Array, x: Array) -> float:
-        return self.weight * self.canonical.value(x) + (0.0 if self.damping is None else self.damping.value(z))
+    def _others(self, x: Array) -> float:
+        pull = 0.0 if self.damping is None else self.damping.value(x[self.canonical.at])
+        return self.weight * self.canonical.value(x) + pull
 
-    def _value(self, z: Array, x: Array) -> float:
-        return self._total(self._residual(z)) + self._others(z, x)
+    def _value(self, x: Array) -> float:
+        return self._total(self._residual(x)) + self._others(x)
 
     def _solved(self, z: Array, gradient: Array, H: Array, small: ReducedProgram | None = None, *exact: Array) -> Point:
         """Return the minimum of the quadratic model around z (n,), with the penalty and the constraints."""
@@ -197,14 +198,14 @@ class Newton:
 
     # --- smooth losses -----------------------------------------------------------------------------------------------
 
-    def smooth(self, z: Array, x: Array, h: float = 0.0, tolerance: float = DECREASE, most: int = STEPS) -> Array:
-        """Return the minimum (n,) of the loss smoothed with width h, from z with x of the canonical form."""
+    def smooth(self, h: float = 0.0, tolerance: float = DECREASE, most: int = STEPS) -> None:
+        """Go to the minimum of the loss smoothed with width h."""
         at, T, weight = self.canonical.at, self.rows.whitened[1], self.weight
-        self.x = x
-        r = self._residual(z)
+        r = self._residual(self.x)
         size = max(min(abs(self._total(r)), float(len(r))), TINY)  # outliers do not loosen the tolerance
         secants, t_before = 0.0, 0.0
         for _ in range(most):
+            z = self.x[at]
             gradient, H = self._model(r, h)
             pivots = np.diag(np.linalg.cholesky(H + PROXIMAL * np.trace(H) * np.eye(len(H))))
             if secants or pivots.min() < POOR * pivots.max():
@@ -232,13 +233,11 @@ class Newton:
                 break
             secants *= FEWER if t == 1.0 else 1.0
             t_before = t
-            z = z + t * d
             r = r + t * Ad
             self.x = self.x + t * (ahead - self.x)
             # the model's error along the step predicts the gain of the next one
             if (t == 1.0 and predicted * left**2 <= 0.01 * tolerance * size) or t * np.abs(d).max() < 1e-15:
                 break
-        return z
 
     def _search(self, r: Array, Ad: Array, chord: float, bend: float, h: float, before: float) -> tuple[float, float]:
         """Return t in (0, 1] where the derivative along the step is small, and how small: no value of it is needed."""
@@ -260,32 +259,26 @@ class Newton:
 
     # --- non-smooth losses -------------------------------------------------------------------------------------------
 
-    def non_smooth(self, z: Array, x: Array, warm_width: float, warm: bool) -> tuple[Array, float]:
-        """Return the minimum (n,) of a non-smooth loss, and the width of smoothing at which it was found."""
-        self.x = x
-        if warm and warm_width:
-            exact = self._exact(z, warm_width)
-            if exact is not None:
-                return exact, warm_width
-        v = np.abs(self.rows.entries(self._residual(z)))
+    def non_smooth(self, warm_width: float, warm: bool) -> float:
+        """Go to the minimum of a non-smooth loss, and return the width of smoothing at which it was found."""
+        if warm and warm_width and self._exact(warm_width):
+            return warm_width
+        v = np.abs(self.rows.entries(self._residual(self.x)))
         h = float(np.median(v)) / (NARROWER if warm else 1.0)
         floor = NARROWEST * max(float(np.mean(v)), TINY)
         while h > floor:
-            r = self._residual(z)
+            r = self._residual(self.x)
             total, added = self._total(r), self._added(self.rows.entries(r), h)
-            before, z_before, x_before = total + self._others(z, self.x), z, self.x
+            before, x_before = total + self._others(self.x), self.x
             size = max(abs(total), TINY)
-            z = self.smooth(z, self.x, h, max(SMOOTHED * added / size, DECREASE), 30)
-            if self._value(z, self.x) > before + 2 * added + 1e-12 * abs(before):  # more than rounding
+            self.smooth(h, max(SMOOTHED * added / size, DECREASE), 30)
+            if self._value(self.x) > before + 2 * added + 1e-12 * abs(before):  # more than rounding
                 self.x = x_before
-                return z_before, h
-            if added <= 0:
-                return z, h
-            exact = self._exact(z, h)
-            if exact is not None:
-                return exact, h
+                return h
+            if added <= 0 or self._exact(h):
+                return h
             h /= NARROWER
-        return z, h
+        return h
 
     def _added(self, v: Array, h: float) -> float:
         """Return what smoothing with width h may add to the loss: to that of a norm everywhere."""
@@ -301,19 +294,22 @@ class Newton:
         rise = self.loss.slope(v + h) - self.loss.slope(np.maximum(v - h, -1e-12))
         return np.flatnonzero((rise > 0.1 * self.jump) | (v < h))
 
-    def _exact(self, z: Array, h: float) -> Array | None:
-        """Return the minimum with rows near a non-smooth point as they are and the others by their quadratic model."""
+    def _exact(self, h: float) -> bool:
+        """Go to the minimum with rows near a non-smooth point as they are and the others by their quadratic model.
+
+        Return whether that is the minimum; otherwise the point stays.
+        """
         at, T = self.canonical.at, self.rows.whitened[1]
-        near = self._near(self.rows.entries(self._residual(z)), 3 * h)
+        x, best = self.x, self.point
+        near = self._near(self.rows.entries(self._residual(x)), 3 * h)
         few = max(NEAR * self.rows.A.shape[1], 200)
         if len(near) > few:
-            return None
-        x, best = self.x, self.point
-        value = self._value(z, x)
+            return False
+        value = self._value(x)
         for _ in range(8):
             if len(near) > 2 * few:
-                return None
-            r = self._residual(z)
+                return False
+            r = self._residual(x)
             gradient, H = self._model(r, 0.0, near)
             small = self.small
             exact: tuple[Array, ...] = ()
@@ -321,26 +317,24 @@ class Newton:
                 small = self.rows.program(self.loss, near, self.canonical, small.rows)
                 exact = self.rows.equations(near)
             try:
-                point = self._solved(z, gradient, H, small, *exact)
+                point = self._solved(x[at], gradient, H, small, *exact)
             except (Unsolved, np.linalg.LinAlgError):
-                return None
-            ahead = point.x[at]
-            d = ahead - z
-            v, v_ahead = self.rows.entries(r), self.rows.entries(self._residual(ahead))
+                return False
+            v, v_ahead = self.rows.entries(r), self.rows.entries(self._residual(point.x))
             old, new = self.loss.values(v)[near].sum(), self.loss.values(v_ahead)[near].sum()
-            u = T @ d
-            chord = self._others(ahead, point.x) - self._others(z, x)
+            u = T @ (point.x - x)[at]
+            chord = self._others(point.x) - self._others(x)
             predicted = -(gradient @ u + 0.5 * u @ H @ u + chord + new - old)
-            there = self._value(ahead, point.x)
+            there = self._value(point.x)
             if there <= value:
-                z, value, x, best = ahead, there, point.x, point
+                value, x, best = there, point.x, point
             if predicted <= 1e-9 * max(abs(value), 1e-9):
                 self.x, self.point = x, best
-                return z
+                return True
             curved = np.abs(self.loss.slope(v_ahead) - self.loss.slope(v)) > 0.1 * self.jump
-            beside = self._near(self.rows.entries(self._residual(z)), h)
+            beside = self._near(self.rows.entries(self._residual(x)), h)
             near = np.union1d(near, np.union1d(np.flatnonzero(curved), beside))
-        return None
+        return False
 
 
 def gram(A: Array, weights: Array) -> Array:

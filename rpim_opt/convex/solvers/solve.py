@@ -24,10 +24,9 @@ GAP = 1e-8
 
 @dataclass(eq=False)
 class WarmStart:
-    """Warm start of the next solution: point, smoothing width, the last working set, Clarabel's data."""
+    """Warm start of the next solution: the canonical form's point x (N,), smoothing width, last working set, data."""
 
     structure: Structure
-    z: Array | None = None
     x: Array | None = None
     width: float = 0.0
     part: tuple[np.ndarray, ReducedProgram] | None = None
@@ -51,7 +50,7 @@ class WarmStart:
     def begin(self, z: Array) -> WarmStart:
         """Discard all solvers, and start the next solution from z (n,)."""
         with self.lock:
-            self.z = self.x = z if len(self.canonical.at) == self.canonical.size else None
+            self.x = z if len(self.canonical.at) == self.canonical.size else None
             self.width, self.part, self.small = 0.0, None, {}
         return self
 
@@ -86,7 +85,7 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
                 point = _by_newton(loss, rows, warm, weight, damping)
             except (OutsideDomain, np.linalg.LinAlgError):
                 point = _all_rows(loss, rows, warm, weight, damping)
-        warm.z, warm.x = point.x[warm.canonical.at], point.x
+        warm.x = point.x
         return point
 
 
@@ -94,7 +93,7 @@ def _by_newton(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: 
     few = loss.variable.size <= FEW_ENTRIES
     # piecewise linear: one program of all rows; piecewise quadratic: the same if Newton's first small programs need
     # cones, or start with an unknown active set
-    begun = warm.z is not None
+    begun = warm.x is not None
     quick = begun or (warm.canonical.polyhedral and warm.canonical.size == len(warm.canonical.at))
     if few and (loss.expression.is_pwl() or (loss.piecewise_quadratic and not quick)):
         return _all_rows(loss, rows, warm, weight, damping)
@@ -103,16 +102,15 @@ def _by_newton(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: 
     if few and warm.jump:
         return _all_rows(loss, rows, warm, weight, damping)
     small = warm.program(rows.A.shape[1] + 1)
-    z, x = warm.z, warm.x
-    if z is None or x is None:
+    x = warm.x
+    if x is None:
         x = small.solve(rows.squares.damped(damping), weight).x
-        z = x[warm.canonical.at]
-    search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.jump)
+    search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.jump, x)
     if warm.jump:
-        z, warm.width = search.non_smooth(z, x, warm.width, begun)
+        warm.width = search.non_smooth(warm.width, begun)
     else:
-        z = search.smooth(z, x)
-    if not np.isfinite(z).all():
+        search.smooth()
+    if not np.isfinite(search.x[warm.canonical.at]).all():
         raise OutsideDomain
     dual = np.zeros(len(warm.canonical.b)) if search.point is None else search.point.dual
     return Point(search.x, dual, search.steps)
@@ -143,10 +141,10 @@ def _by_largest(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping:
         return _all_rows(loss, rows, warm, weight, damping)
     terms = _alone(n, damping)
     working, small = warm.part or (np.zeros(0, dtype=int), None)
-    z = warm.z
-    if z is None:
-        z = warm.program(n + 1).solve(rows.squares.damped(damping), weight).x[at]
-    values = loss.values(rows.entries(rows.A @ z - rows.b))
+    x = warm.x
+    if x is None:
+        x = warm.program(n + 1).solve(rows.squares.damped(damping), weight).x
+    values = loss.values(rows.entries(rows.A @ x[at] - rows.b))
     for _ in range(GENERATIONS):
         if small is None or small.rows != len(terms.y):
             working = np.union1d(working, np.argsort(-values)[: 4 * n + int(loss.largest)])
