@@ -355,7 +355,6 @@ class Loss:
 
     def __init__(self, expression: Any, variable: Any, positive: bool):
         self.expression, self.variable, self.positive = expression, variable, positive
-        self.piecewise_quadratic = bool(expression.is_qpwa())
         self.entries: Any = None
         self.largest = 0.0
         if {v.id for v in expression.variables()} == {variable.id}:

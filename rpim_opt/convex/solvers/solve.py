@@ -95,7 +95,7 @@ def _by_newton(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: 
     # cones, or start with an unknown active set
     begun = warm.x is not None
     quick = begun or (warm.canonical.polyhedral and warm.canonical.size == len(warm.canonical.at))
-    if few and (loss.expression.is_pwl() or (loss.piecewise_quadratic and not quick)):
+    if few and (loss.expression.is_pwl() or (not quick and loss.expression.is_qpwa())):
         return _all_rows(loss, rows, warm, weight, damping)
     if warm.jump < 0:
         warm.jump = loss.slope_jump(rows)
