@@ -55,7 +55,6 @@ PARTS = re.compile(r"(j|a|q|joint_?|axis_?)1(?: \1\d)+")
 """What tables with one row per quantity name in that row: the axes and whatever else, or joints alone, sorted."""
 VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.IGNORECASE)
 """What the column is called that holds the coordinates of a table with one row per coordinate."""
-"""A number with its unit in the cell."""
 UNITS_WORD = re.compile(r"\b(?:units?|einheit(?:en)?|unités?|unidades|unità)\b", re.IGNORECASE)
 """Words before the units in a line above the header."""
 JOINING = ("in", "and", "und", "et", "y", "e")

@@ -33,7 +33,6 @@ class Requirement:
     other joints within the measured ranges; ``measured``: only at the measured configurations there. ``marker`` is the
     reflector, by default the first. InputError for a limit or confidence that nothing can meet, and sides that are not
     (low, high).
-    (low, high).
 
     >>> import rpim_opt as ro
     >>> print(ro.data.Requirement(1e-4, box=((0.3, 0.8), (-0.2, 0.2), (0.0, 0.5))).where)

@@ -312,10 +312,8 @@ def _parameters(content: Content) -> Iterator[Block]:
         of, values, _ = Prior.known(text).statements[0].on(result.problem.parameters)
         known += [[text, f"{off:+.2f}"] for off in of @ result.z - values]
     if known:
-        yield (
-            "table",
-            Table("Known values", ["stated", "identified minus stated, in stated standard deviations"], known),
-        )
+        compared = ["stated", "identified minus stated, in stated standard deviations"]
+        yield "table", Table("Known values", compared, known)
     curves = transmission_errors(result)
     if not curves:
         return

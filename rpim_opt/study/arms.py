@@ -11,6 +11,7 @@ import scipy
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.closed_forms import rigid
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import model_parameters
@@ -93,8 +94,8 @@ def flange(robot: Robot, q: Array, errors: Array) -> Array:
     """Return the frames (N, 4, 4) after the last of revolute joints, each followed by a small transform."""
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     for (alpha, a, theta, d, beta), angle, error in zip(robot.mdh, (q @ robot.joint_map.T).T, errors, strict=True):
-        turn = np.tile(np.eye(4), (len(q), 1, 1))
-        turn[:, :3, :3] = scipy.spatial.transform.Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
+        about_z = scipy.spatial.transform.Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
+        turn = rigid(about_z, np.zeros(3))
         behind = _small(np.array([0, 0, d, 0, beta, 0]))
         T = T @ _small(np.array([a, 0, 0, alpha, 0, 0])) @ turn @ behind @ _small(error)
     return T
@@ -102,7 +103,4 @@ def flange(robot: Robot, q: Array, errors: Array) -> Array:
 
 def _small(numbers: Array) -> Array:
     """Return the transform (4, 4) of a translation and a rotation vector."""
-    T = np.eye(4)
-    T[:3, :3] = scipy.spatial.transform.Rotation.from_rotvec(numbers[3:]).as_matrix()
-    T[:3, 3] = numbers[:3]
-    return T
+    return rigid(scipy.spatial.transform.Rotation.from_rotvec(numbers[3:]).as_matrix(), numbers[:3])

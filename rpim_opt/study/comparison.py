@@ -240,7 +240,25 @@ class Comparison:
         Arguments and errors as for `summary`.
         """
         summary = self.summary(metric, against)
-        return _ratios(summary, figures(self.rows, summary.metric))
+        of = figures(self.rows, summary.metric)
+        other = of[summary.reference]
+        ratios = {
+            each.method: [value / other[pair] for pair, value in of[each.method].items() if other.get(pair)]
+            for each in summary.standings
+        }
+        known = [each for each in summary.standings if ratios[each.method]]
+        label = f"{summary.metric} over that of {summary.reference}, same replicate"
+        figure = distributions({each.method: ratios[each.method] for each in known}, label)
+        (ax,) = figure.axes
+        ax.axvline(1, color="0.4", lw=1, zorder=1)
+        for y, each in enumerate(known):
+            if each.low is not None and each.high is not None:
+                colour = "0.3"
+                if each.different:
+                    colour = "C2" if each.high < 1 else "C3"
+                ax.plot([each.low, each.high], [y, y], lw=2, color=colour)
+        ax.set_title("dots: replicates, medians marked; bars: 95 % interval of the geometric mean", fontsize=9)
+        return figure
 
     def report(self, folder: str | Path) -> Path:
         """Write ``README.md`` with the summary and the medians by problem, the figure, and ``replicates.csv``.
@@ -472,25 +490,3 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
         ax.annotate(f"{middle:.3g}", (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=8)
     logarithmic(ax, "x")
     return ax.figure
-
-
-def _ratios(summary: Summary, of: Mapping[str, Mapping[Pair, float]]) -> Any:
-    """Return the figure: ratios of the methods that have some, with their medians, and intervals of their means."""
-    other = of[summary.reference]
-    ratios = {
-        each.method: [value / other[pair] for pair, value in of[each.method].items() if other.get(pair)]
-        for each in summary.standings
-    }
-    known = [each for each in summary.standings if ratios[each.method]]
-    label = f"{summary.metric} over that of {summary.reference}, same replicate"
-    figure = distributions({each.method: ratios[each.method] for each in known}, label)
-    (ax,) = figure.axes
-    ax.axvline(1, color="0.4", lw=1, zorder=1)
-    for y, each in enumerate(known):
-        if each.low is not None and each.high is not None:
-            colour = "0.3"
-            if each.different:
-                colour = "C2" if each.high < 1 else "C3"
-            ax.plot([each.low, each.high], [y, y], lw=2, color=colour)
-    ax.set_title("dots: replicates, medians marked; bars: 95 % interval of the geometric mean", fontsize=9)
-    return figure

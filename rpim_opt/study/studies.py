@@ -30,7 +30,7 @@ from rpim_opt.basics.tables import library
 from rpim_opt.basics.text import Progress, version_of
 from rpim_opt.data.record import PACKAGES
 from rpim_opt.store.own_code import run_file
-from rpim_opt.store.problem_file import problems_folder
+from rpim_opt.store.problem_file import PACKAGE, problems_folder
 
 NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
 """Required names of a study; an optional prepare(quick) is called once before the first case."""
@@ -63,7 +63,6 @@ class Report:
 
 Row = dict[str, Any]  # a case with its figures
 Work = Callable[[], Row]  # computation of a replicate; it travels to wherever it is computed
-PACKAGE = Path(__file__).resolve().parents[1]
 STUDIES = PACKAGE.parent / "studies"  # of the checkout; an installed package has none
 LIBRARIES = [Path(sysconfig.get_path(key)).resolve() for key in ("stdlib", "platstdlib", "purelib", "platlib")]
 """Folders of Python files that are identified by the versions of packages."""

@@ -95,12 +95,9 @@ def _targets(robot: Robot, understanding: Interpretation) -> Targets:
     if any(each.doubt == "quaternion" for each in understanding.tables):
         raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
     if "rx_rad" in columns and not joints and any(each.doubt == "rotation" for each in understanding.tables):
+        found = "rx, ry, rz in rad without joint values, which would tell a rotation vector from angles"
         accepted = "--rotation vector (Universal Robots), or --rotation 'extrinsic xyz' (roll, pitch, yaw)"
-        raise InputError(
-            "the header",
-            "rx, ry, rz in rad without joint values, which would tell a rotation vector from angles",
-            accepted,
-        )
+        raise InputError("the header", found, accepted)
     if not joints and not positions:
         raise InputError("the header", "no targets", "columns q1_deg, ..., or x_mm, y_mm, z_mm, or both")
     absent = [*joint_columns(robot.joint_dimensions)] * (not joints) + ["x_mm", "y_mm", "z_mm"] * (not positions)

@@ -208,7 +208,7 @@ def _key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Key:
     pairs = _pairs(joints, values, key)
     telling = [pair for pair in pairs if not counts_rows(pair.left)]
     if key == "row":
-        return _row_numbers(joints, values, _only(telling))
+        return _row_numbers(joints, values, telling[0] if len(telling) == 1 else None)
     common = [name for name in joints.raw if name in values.raw]
     common = [name for name in common if name == key.lower() or not COUNTER.fullmatch(name)]
     for chosen in _keys(joints, values, key, common, telling or pairs):
@@ -242,11 +242,6 @@ def _keys(
     same = pairs or _pairs(joints, values, key, numbers=True)
     if len(same) == 1:
         yield same[0]
-
-
-def _only(items: Sequence[Any]) -> Any:
-    """Return the only one; None where there is none, or several."""
-    return items[0] if len(items) == 1 else None
 
 
 def _pairs(joints: CanonicalTable, values: CanonicalTable, key: str, numbers: bool = False) -> list[Key]:
