@@ -136,7 +136,7 @@ def load(
         if validation is not None:
             problem.on(validation)  # raises for rows that the problem's robot or reflectors cannot have
         formulation = _formulation(definition, problem)
-        prior = problem_file.stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
+        prior = problem_file.stated_prior(definition, problem.parameters, measurements)
         problem = problem.with_parameters(prior.where_known(problem.parameters, problem.parameters))
         unstated = [name for each in prior.statements if each.reference is None for name in each.names]
         for name in unstated:

@@ -435,23 +435,19 @@ def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:
 # --- sections other than data --------------------------------------------------------------------------------------
 
 
-def stated_prior(
-    table: PriorTable,
-    scale: Mapping[str, float],
-    parameters: Parameters,
-    path: Path,
-    measurements: Sequence[Measurement],
-) -> Prior:
+def stated_prior(stated: ProblemFile, parameters: Parameters, measurements: Sequence[Measurement]) -> Prior:
     """Return the prior of a problem file, checked against the problem's parameters.
 
     A ``scale`` of joint offsets alone, or of a parameter by its name, is final, without the prior's factors: it was
     stated deliberately, for instance from a certificate's standard uncertainty of a reflector's place.
     """
+    table = stated.table.prior
+    path = stated.path
     for key in ("inflate", "without"):
         if key in table.model_fields_set and not table.earlier:
             raise InputError(f"key prior.{key}", "no key from in addition", "from = 'other/result.json'", path)
     offsets = {}
-    for key, value in scale.items():
+    for key, value in stated.table.scale.items():
         stem = split_unit(key)[0]
         matches = [name for name in parameters.names if fits(name, stem)]
         if stem == JOINT_OFFSET or stem in parameters.names or (matches and all(map(is_joint_offset, matches))):
@@ -515,9 +511,8 @@ def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requi
     """Return the requirement of ``[acceptance]`` (its keys: the guide "Results"); None for an empty table."""
     if not table:
         return None
-    joints = _joints(robot)
     pair = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
-    known = dict.fromkeys(BOX, ("length",)) | joints
+    known = dict.fromkeys(BOX, ("length",)) | _joints(robot)
     fields: dict[str, Any] = {name: (Annotated[pair, dimension], None) for name, (dimension,) in known.items()}
     fields |= {"limit": (Length, ...), "confidence": (float, CONFIDENCE), "marker": (str, "")}
     fields["measured"] = (bool, False)

@@ -25,7 +25,7 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import pose, position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_known_masses, require_same_torques
+from rpim_opt.problem.row_functions import loads_on, measured_torques, require_known_masses, require_same_torques
 from rpim_opt.robot import kinematics
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, call_rows, chain, forward_kinematics, numeric_frame, product
@@ -407,7 +407,7 @@ Aim = tuple[Array, Array, Array, Array, Array]
 class _Cell:
     """The controller's robot, the identified one, and the uncertainty of its position.
 
-    Both are functions of joint values, loads and targets (`pose_function`).
+    Both are functions of joint values, loads and targets (`_poses`).
     """
 
     def __init__(
@@ -434,8 +434,7 @@ class _Cell:
             raise InputError("--marker", found, f"{named}, or a controller's TCP by --tool")
         if tool is not None:
             marker = known[0]
-        prefix = tool_prefix(marker)
-        at = p.frame(prefix)
+        at = p.frame(tool_prefix(marker))
         if tool is None:
             place = p.values(x)[at]
             how = "as identified, " * bool(p.identified[at].any())
@@ -472,8 +471,38 @@ class _Cell:
         self.ranges = result.ranges[which]
         require_same_torques(robot, p, measured_torques(measured.data), torques)
         self.loads = loads_on(robot, p, measured.data, torques)
-        self.nominal = pose_function(robot, nominal, nominal, prefix, np.eye(4), kind, self.loads)
-        self.identified = pose_function(robot, identified, nominal, prefix, moved, kind, self.loads)
+        self.nominal = self._poses(nominal, nominal, np.eye(4))
+        self.identified = self._poses(identified, nominal, moved)
+
+    def _poses(self, values: Mapping[str, float], nominal: Mapping[str, float], before: Array) -> PoseFunction:
+        """Return the function of joint values q (N, dof), loads and targets y (N, c) of a robot with these values.
+
+        It returns the pose (N, c), its error (N, k) from y, and the Jacobian (N, k, dof) of the pose. Gravity acts on
+        the ``nominal`` values.
+        """
+        robot = self.robot
+        tool = tool_prefix(self.marker)
+        command = self.loads.symbols(len(robot.joint_types), 1)
+        y = ca.SX.sym("y", len(self.kind.columns))
+
+        def value(name: str) -> float:
+            return values.get(name, 0.0)
+
+        configuration = self.loads.configuration(robot.joint_types, nominal.__getitem__, command)
+        flange = chain(robot.joint_types, configuration, value, robot.model.terms)
+        T = product([ca.SX(ca.DM(before)), *flange, *kinematics.placed([value(tool + c) for c in FRAME])])
+        # motion of T's point and orientation by the joints; gravity deflects a joint depending on all joint values
+        turn = sum(ca.skew(T[:3, k]) @ ca.jacobian(T[:3, k], command["q"]) for k in range(3)) / 2
+        J = ca.vertcat(ca.jacobian(T[:3, 3], command["q"]), turn)[: len(self.kind.components), :]
+        modelled = self.kind.model(T)
+        outputs = [ca.densify(v) for v in (modelled, self.kind.minus(y, modelled), J.T)]
+        function = ca.Function("arm", [ca.vertcat(*command.values(), y)], outputs)
+
+        def at(q: Array, load: Array, y: Array) -> tuple[Array, Array, Array]:
+            modelled, error, J = call_rows(function, [], np.hstack([q @ robot.joint_map.T, load, y]))
+            return modelled[:, 0], error[:, 0], J @ robot.joint_map
+
+        return at
 
     def aim(self, targets: Targets) -> Aim:
         """Return the uncorrected commands of some targets, and what these miss."""
@@ -629,43 +658,6 @@ def is_reached(error: Array, W: Array) -> np.ndarray:
 # --- inverse kinematics within joint limits, many rows at once ---------------------------------------------
 
 PoseFunction = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
-
-
-def pose_function(
-    robot: Robot,
-    values: Mapping[str, float],
-    nominal: Mapping[str, float],
-    tool: str,
-    before: Array,
-    kind: Measurement,
-    loads: Loads,
-) -> PoseFunction:
-    """Return the function of joint values q (N, dof), loads and targets y (N, c) of a robot with these values.
-
-    It returns the pose (N, c), its error (N, k) from y, and the Jacobian (N, k, dof) of the pose. Gravity acts on the
-    ``nominal`` values.
-    """
-    command = loads.symbols(len(robot.joint_types), 1)
-    y = ca.SX.sym("y", len(kind.columns))
-
-    def value(name: str) -> float:
-        return values.get(name, 0.0)
-
-    configuration = loads.configuration(robot.joint_types, nominal.__getitem__, command)
-    flange = chain(robot.joint_types, configuration, value, robot.model.terms)
-    T = product([ca.SX(ca.DM(before)), *flange, *kinematics.placed([value(tool + c) for c in FRAME])])
-    # motion of T's point and orientation by the joints; gravity deflects a joint depending on all joint values
-    turn = sum(ca.skew(T[:3, k]) @ ca.jacobian(T[:3, k], command["q"]) for k in range(3)) / 2
-    J = ca.vertcat(ca.jacobian(T[:3, 3], command["q"]), turn)[: len(kind.components), :]
-    modelled = kind.model(T)
-    outputs = [ca.densify(v) for v in (modelled, kind.minus(y, modelled), J.T)]
-    function = ca.Function("arm", [ca.vertcat(*command.values(), y)], outputs)
-
-    def at(q: Array, load: Array, y: Array) -> tuple[Array, Array, Array]:
-        modelled, error, J = call_rows(function, [], np.hstack([q @ robot.joint_map.T, load, y]))
-        return modelled[:, 0], error[:, 0], J @ robot.joint_map
-
-    return at
 
 
 def nearest(

@@ -156,13 +156,12 @@ def read_measurements(
     >>> len(found.data), found.left_out, float(found.when[1] - found.when[0]) / 86400
     (2, ('note',), 31.0)
     """
-    robot = result.problem.robot
     blocks = result.problem.data.blocks
     types = {block.measurement.name: block.measurement for block in blocks if block.measurement not in KNOWN}
     if not measurement and len(types) != 1:
         raise InputError("measurement", "several", choices("", types))
     calibrated = pick(types, measurement or next(iter(types)), "measurement")
-    arm = RobotSetup(robot)
+    arm = RobotSetup(result.problem.robot)
     understanding = _understood(result, source, calibrated, options or TableOptions(), arm)
     columns = understanding.columns
     stems = {split_unit(name)[0] for name in columns}
