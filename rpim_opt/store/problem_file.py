@@ -37,11 +37,9 @@ from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import JOINT_OFFSET, Parameters, is_joint_offset
-from rpim_opt.robot.terms import Model as KinematicModel
-from rpim_opt.robot.terms import Term
+from rpim_opt.robot.terms import Model, Term
 from rpim_opt.store.own_code import is_own, own_object
 
-Model = Literal["geometry", "auto"]
 Noise = Literal["robot", "free", "level", "declared"]
 PACKAGE = Path(__file__).resolve().parents[1]
 MEASURED = "measured"  # The predefined place of all problems: the configurations of the identification data.
@@ -280,7 +278,7 @@ class ProblemTable(Table):
     identify: list[Name] | Literal["auto"]  # Patterns of the parameters to identify, or auto.
     formulation: str = "tikhonov"  # Name of a ready formulation.
     selector: str = "learned"  # learned (prior scales), the name of a selection rule, or a number.
-    model: Model = "geometry"  # auto: model extensions by evidence; geometry: none.
+    model: Literal["geometry", "auto"] = "geometry"  # auto: model extensions by evidence; geometry: none.
     repeatability: RepeatabilityTable | Noise = "robot"  # Components: robot, free, level, declared; or stated.
     noise: dict[str, Any] = Field({})  # Measurement noise of rows that state none.
     scale: dict[Name, Any] = Field({})  # Prior standard deviations, by kind, pattern or name.
@@ -335,7 +333,7 @@ def read_problem(
     name: str | Path,
     variant: str | None = None,
     measurements: Sequence[Measurement] = (),
-    model: KinematicModel | None = None,
+    model: Model | None = None,
     chain: str | None = None,
 ) -> ProblemFile:
     """Return the content of a problem file, of the first of several chains by default; arguments as for `load`."""
@@ -398,7 +396,7 @@ def _checked(
     return validate(ProblemTable, {k: v for k, v in content.items() if k not in placed}, path, where), placed
 
 
-def _arm(table: ProblemTable, path: Path, model: KinematicModel | None) -> RobotSetup:
+def _arm(table: ProblemTable, path: Path, model: Model | None) -> RobotSetup:
     """Return the robot with its gravity, and terms of a script or of the file."""
     file = find_robot(table.robot, path.parent)
     if file.suffix != ".urdf" and (table.urdf_base or table.urdf_tip or table.chain):
@@ -408,11 +406,11 @@ def _arm(table: ProblemTable, path: Path, model: KinematicModel | None) -> Robot
     turned = numeric_frame(arm.base)[:3, :3]
     gravity = gravity_with(arm.robot.gravity, table.mounting, table.payload, path, turned)
     if model is None:
-        model = KinematicModel([own_object(term, Term, "key terms", path) for term in table.terms])
-    if not isinstance(model, KinematicModel):
+        model = Model([own_object(term, Term, "key terms", path) for term in table.terms])
+    if not isinstance(model, Model):
         accepted = "a ro.robot.Model with terms of your own; extensions are chosen by calibrate(model='auto')"
         raise InputError("model", f"{model!r}"[:80], accepted)
-    whole = KinematicModel((*arm.robot.model.terms, *model.terms))
+    whole = Model((*arm.robot.model.terms, *model.terms))
     return replace(arm, robot=replace(arm.robot, gravity=gravity, model=whole))
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
@@ -390,7 +389,7 @@ def figures(rows: Rows, metric: str) -> dict[str, dict[Pair, float]]:
     return of
 
 
-def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[float | None, float | None, float | None]:
+def interval(ratios: Mapping[Pair, float], drawn: frozenset[str]) -> tuple[float | None, float | None, float | None]:
     """Return the geometric mean of paired ratios, given as logarithms, and the ends of its 95 % interval.
 
     Replicates of one problem are correlated. The mean is over the problems' means; with five or more problems,
@@ -423,7 +422,7 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
     return float(np.exp(middle)), float(np.exp(middle - half)), float(np.exp(middle + half))
 
 
-def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> Iterator[str]:
+def _notes(rows: Rows, standings: Sequence[Standing], drawn: frozenset[str], reference: str) -> Iterator[str]:
     """Yield the notes below the table: of what the ratios and intervals speak, and what has no results."""
     yield f"Ratios compare the same replicates in pairs; geometric mean over problems; a tie is within {TIE:.0%}."
     compared = sum(each.low is not None and each.method != reference for each in standings)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from importlib import import_module
 from types import MappingProxyType
@@ -111,7 +110,7 @@ class Measurement(Brief):
     def _short(self) -> str:
         return f"'{self.name}': {', '.join(self.components)}"
 
-    def stands_in(self, stems: AbstractSet[str]) -> bool:
+    def stands_in(self, stems: set[str]) -> bool:
         """Whether a table has its columns in any form; for two points, also one of the second (``to_...``)."""
         forms = [self.columns, *(form for form, _ in self.forms)]
         second = self.points < 2 or any(stem.startswith("to_") for stem in stems)
