@@ -151,31 +151,21 @@ class RawTable:
 
 
 def read_table(
-    path: Path,
-    options: TableOptions | None = None,
-    columns: Columns | None = None,
-    turned: Callable[[Grid], bool] = lambda grid: False,
+    path: Path, options: TableOptions | None = None, turned: Callable[[Grid], bool] = lambda grid: False
 ) -> RawTable:
-    """Return the table of a raw file, or of columns of texts, with one number per cell and one row per point.
-
-    A grid that is ``turned`` has rows and columns exchanged.
-    """
+    """Return the table of a raw file, whose rows and columns are exchanged if its grid is ``turned``."""
     options = options or TableOptions()
     readers = {".parquet": read_columns, ".mat": array_columns, ".npz": array_columns}
     reader = readers.get(path.suffix.lower())
     with in_file(path):
-        if columns is None and reader is not None:
-            columns = reader(path)
-        if columns is None:
-            grid = read_grid(path, options.sheet, options.encoding, options.separator)
-            if turned(grid):
-                rows = [list(cells) for cells in zip_longest(*grid.rows, fillvalue="")]
-                notes = (*grid.notes, "one row per quantity: transposed.")
-                grid = Grid(rows, list(range(1, len(rows) + 1)), notes)
-            table = _of_grid(grid, options)
-        else:
-            table = RawTable(columns)
-        return _one_row_each(_one_number_each(table))
+        if reader is not None:
+            return unfolded(RawTable(reader(path)))
+        grid = read_grid(path, options.sheet, options.encoding, options.separator)
+        if turned(grid):
+            rows = [list(cells) for cells in zip_longest(*grid.rows, fillvalue="")]
+            notes = (*grid.notes, "one row per quantity: transposed.")
+            grid = Grid(rows, list(range(1, len(rows) + 1)), notes)
+        return unfolded(_of_grid(grid, options))
 
 
 def is_missing(cell: str) -> bool:
@@ -470,6 +460,11 @@ def _unit_of(cells: Sequence[str]) -> str:
 
 
 # --- cells that list numbers, rows that hold one coordinate ----------------------------------------------------------
+
+
+def unfolded(table: RawTable) -> RawTable:
+    """Return a table with one number per cell and one row per point."""
+    return _one_row_each(_one_number_each(table))
 
 
 def _one_number_each(table: RawTable) -> RawTable:

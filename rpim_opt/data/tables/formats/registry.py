@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError, in_file
 from rpim_opt.basics.files import LARGEST_DATA, require_file
-from rpim_opt.basics.layout import RawTable, TableOptions, read_table
+from rpim_opt.basics.layout import RawTable, TableOptions, read_table, unfolded
 from rpim_opt.basics.tables import EXCEL, TEXTS, Grid, decoded
 
 Rows = Sequence[Mapping[str, Any]]
@@ -46,17 +46,17 @@ def read_raw(
         accepted = ", ".join(sorted(plain.union(*(each.endings for each in every))))
         raise InputError("the file's name", f"'{path.name}'", f"a name ending in {accepted}", path)
     if not fitting:
-        return read_table(path, options, turned=turned)
+        return read_table(path, options, turned)
     with in_file(path):
         require_file(path, LARGEST_DATA)
         text, _ = decoded(path, options.encoding if options else "")
         name, rows = next(((each.name, rows) for each in fitting if (rows := each.read(text))), ("", ()))
         if not rows and ending in TEXTS:
-            return read_table(path, options, turned=turned)
+            return read_table(path, options, turned)
         if not rows:
             accepted = f"{' or '.join(each.name for each in fitting)} with at least one"
             raise InputError("the file", "neither targets nor rows", accepted)
-    names = dict.fromkeys(name for row in rows for name in row)
-    columns = {name: ["" if row.get(name) is None else str(row[name]) for row in rows] for name in names}
-    raw = read_table(path, options, columns)
+        names = dict.fromkeys(name for row in rows for name in row)
+        columns = {name: ["" if row.get(name) is None else str(row[name]) for row in rows] for name in names}
+        raw = unfolded(RawTable(columns))
     return replace(raw, notes=(f"read as {name}.", *raw.notes))
