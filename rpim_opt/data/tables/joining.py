@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -204,44 +204,36 @@ def _few_common(joints: CanonicalTable, values: CanonicalTable, key: Key, count:
 
 
 def _key(joints: CanonicalTable, values: CanonicalTable, key: str) -> Key:
-    """Return the key as stated, else the first of `_keys`."""
+    """Return the key as stated, else the label, the only common column, the only pair with the same values or numbers.
+
+    A label that merely counts rows is none if two columns with the same values distinguish the rows.
+    """
     pairs = _pairs(joints, values, key)
     telling = [pair for pair in pairs if not counts_rows(pair.left)]
     if key == "row":
         return _row_numbers(joints, values, telling[0] if len(telling) == 1 else None)
+    pairs = telling or pairs
+    labels = _normal(joints.columns.get("label", ()))
+    if key in ("", "label") and not (telling and counts_rows(labels)):
+        for column in ("label", "configuration"):
+            other = _keyed("label", (), labels, _normal(values.columns.get(column, ())))
+            if {*labels} & {*other.right}:
+                return other
     common = [name for name in joints.raw if name in values.raw]
     common = [name for name in common if name == key.lower() or not COUNTER.fullmatch(name)]
-    for chosen in _keys(joints, values, key, common, telling or pairs):
-        return chosen
+    stated = [name for name in common if name == key.lower()] if key else common
+    if len(stated) == 1 and (key or not telling or len(pairs) > 1):
+        (name,) = stated
+        return _keyed(f"column '{name}'", (name,), _normal(joints.raw[name]), _normal(values.raw[name]))
+    same = pairs or _pairs(joints, values, key, numbers=True)
+    if len(same) == 1:
+        return same[0]
     found = f"{', '.join(common) or 'no column'} in both {joints.file} and {values.file}"
     if key:
         found = f"'{key}', whose values no column of the other file has"
     for side in (joints, values):
         found += "".join(f"; {name} of {side.file}: {listed(keys, 3)}" for name, keys in _naming(side).items())
     raise InputError("--key", found, f"--key with a column of common values, {OTHER_KEYS}")
-
-
-def _keys(
-    joints: CanonicalTable, values: CanonicalTable, key: str, common: Sequence[str], pairs: Sequence[Key]
-) -> Iterator[Key]:
-    """Yield possible keys: the label, the only ``common`` column, the only pair with the same values or numbers.
-
-    A label that merely counts rows is none if ``pairs``, columns with the same values, distinguish the rows.
-    """
-    counted = all(counts_rows(pair.left) for pair in pairs)
-    labels = _normal(joints.columns.get("label", ()))
-    if key in ("", "label") and (counted or not counts_rows(labels)):
-        for column in ("label", "configuration"):
-            other = _keyed("label", (), labels, _normal(values.columns.get(column, ())))
-            if {*labels} & {*other.right}:
-                yield other
-    stated = [name for name in common if name == key.lower()] if key else common
-    if len(stated) == 1 and (key or counted or len(pairs) > 1):
-        (name,) = stated
-        yield _keyed(f"column '{name}'", (name,), _normal(joints.raw[name]), _normal(values.raw[name]))
-    same = pairs or _pairs(joints, values, key, numbers=True)
-    if len(same) == 1:
-        yield same[0]
 
 
 def _pairs(joints: CanonicalTable, values: CanonicalTable, key: str, numbers: bool = False) -> list[Key]:
