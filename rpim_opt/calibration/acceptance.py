@@ -30,7 +30,7 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import held_out_errors
 from rpim_opt.calibration.verdict import Verdict, ambiguous_deviation, refuse_misread, scatter
-from rpim_opt.calibration.words import VAGUE, underdetermined
+from rpim_opt.calibration.words import VAGUE, on_assumed_masses, underdetermined
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut, Requirement
 from rpim_opt.problem.problem import CalibrationProblem
@@ -367,7 +367,8 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     undecided = () if result.mapping is None else result.mapping.ambiguities
     lacking += [reason for reason in result.verdict.reasons if reason in undecided]
     against = [reason for reason in result.verdict.reasons if reason not in undecided]
-    caution = " ".join(filter(None, [result.verdict.caution, *underdetermined(result)]))
+    masses = on_assumed_masses(result) if data is None else []
+    caution = " ".join(filter(None, [result.verdict.caution, *underdetermined(result), *masses]))
     try:
         mapped = workspace(result, requirement, region, drawn)
     except InputError as error:

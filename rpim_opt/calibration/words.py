@@ -174,18 +174,24 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
         )
     if not result.formulation.solvable:
         lines.append("The result file cannot store functions of a script: use that script to calibrate again.")
-    part = result.problem.sample()
-    if any(masses_assumed(arm.robot, arm.parameters, arm.data) for arm in map(part.alone, part.arms)):
-        lines.append(
-            "Gravity acts on assumed masses of the links: state their masses in the robot file (mass_kg, centre_x_mm, "
-            "...) for smaller errors."
-        )
+    lines += on_assumed_masses(result)
     if result.record.noise_assumed:
         lines.append(
             "The measurement noise is assumed, not stated; uncertainties and verdict depend on it. State the "
             "instrument's in [noise] of problem.toml and remove noise_assumed."
         )
     return [*lines, result.message]
+
+
+def on_assumed_masses(result: Outcome) -> list[str]:
+    """Return a sentence on a deflection by assumed masses of links, whose error no interval contains."""
+    part = result.problem.sample()
+    if not any(masses_assumed(arm.robot, arm.parameters, arm.data) for arm in map(part.alone, part.arms)):
+        return []
+    return [
+        "Gravity acts on assumed masses of the links, whose error U does not contain: state their masses in the robot "
+        "file (mass_kg, centre_x_mm, ...), or test the result on new configurations (`accept --data`)."
+    ]
 
 
 def underdetermined(result: Outcome) -> list[str]:

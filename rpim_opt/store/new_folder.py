@@ -20,9 +20,8 @@ from rpim_opt.basics.units import UNITS, split
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, Board, grid_board, on_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
-from rpim_opt.data.tables.names import recognize
+from rpim_opt.data.tables.names import EXTERNAL, recognize
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.understanding import EXTERNAL
 from rpim_opt.problem.causes.rows import rows_without_values
 from rpim_opt.problem.multi_robot import NAME
 from rpim_opt.problem.problem import CalibrationProblem, identifiable

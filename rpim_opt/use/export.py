@@ -309,7 +309,9 @@ def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
         lines += [f"{curve.joint},{angle:.4f},{value:.5f},{of_value:.5f}" for angle, value, of_value in rows]
     write_text(target, "\n".join(lines) + "\n")
     if not curves:
-        return [f"{target.name} has no rows: the calibration has no transmission errors."]
+        others = [name for name, value in beyond_geometry(result).items() if value]
+        without = f"; `compensate` corrects {listed(others)}" if others else ""
+        return [f"{target.name} has no rows: the calibration has no transmission errors{without}."]
     errors = [f"{curve} {1e3 * curve.rms:.3f}" for curve in curves]
     return [
         f"Transmission errors (RMS, mrad): {joined(errors)}. Angles are those of the controller, within the "

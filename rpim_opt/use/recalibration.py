@@ -384,7 +384,8 @@ def _refuse_another_robot(result: Calibration, updated: Calibration, data: Datas
     if missed > STRANGE * float(np.nanmax(result.nominal_errors())):
         same = f"those of the same robot ({_robots(result)}) in the same units"
         known = " and instrument's frame, or --reset with what moved (base_*)" * (not base_reset)
-        apart = f"; of several set-ups ({joined(data.sessions)}) one at a time" * (len(data.sessions) > 1)
+        several = len(data.sessions) > 1
+        apart = f"; of several set-ups ({joined(data.sessions)}) one at a time" if several else ""
         found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
         raise InputError("the new measurements", found, same + known + apart)
 

@@ -419,6 +419,20 @@ def test_joints_are_called_as_a_robot_table_names_them(tmp_path: Path) -> None:
     assert set(columns) == {"q1_mm", "q2_deg", "x_mm", "y_mm", "z_mm"}
 
 
+def test_quaternions_beside_an_external_axis_are_no_joints(tmp_path: Path) -> None:
+    """Q0 to Q3 were, as A1 to A6 alone did not name all joints."""
+    robot = ro.robot.Robot("on a rail", np.vstack([np.zeros((1, 5)), ARM.mdh]), ("prismatic", *ARM.joint_types))
+    ro.robot.write_robot(robot, tmp_path / "robot.toml")
+    axes = [f"A{i}" for i in range(1, robot.dof)]
+    head = ",".join(["E1 [mm]", *(f"{axis} [deg]" for axis in axes), "X [mm],Y [mm],Z [mm],Q0,Q1,Q2,Q3"])
+    path = write(
+        tmp_path, "".join(f"{head}\n") + f"1{',2' * len(axes)},401,5,6,1,0,0,0\n3{',4' * len(axes)},402,6,7,0,1,0,0\n"
+    )
+    options = ro.data.TableOptions(quaternion="wxyz")
+    columns = interpret_tables(read_arm(tmp_path / "robot.toml"), [path], options=options).columns
+    assert set(columns) >= {"q1_mm", *(f"q{i}_deg" for i in range(2, robot.dof + 1)), "x_mm", "qw", "qx", "qy", "qz"}
+
+
 @pytest.mark.parametrize("targets", [True, False])
 def test_the_pose_that_a_controller_computes_is_a_target_and_no_measurement(tmp_path: Path, targets: bool) -> None:
     head = ",".join(f"{which}_TCP_pose_{i}" for which in ("target", "actual") for i in range(6))

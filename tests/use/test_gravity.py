@@ -179,6 +179,19 @@ def test_gravity_that_files_cannot_hold_is_no_scatter_of_readings(tmp_path: Path
     assert "loose" not in notes
 
 
+def test_acceptance_says_that_masses_are_assumed(tmp_path: Path) -> None:
+    """A sheet without masses: positions were off by twice U, and the test accepted the robot without a word."""
+    problem = bent()
+    unknown = replace(problem, robots=replace(problem.robot, gravity=ro.robot.Gravity()))
+    limit = ro.data.Requirement(2e-3)
+    result = ro.calibrate(unknown, model="auto")
+    said = "Gravity acts on assumed masses of the links, whose error U does not contain"
+    assert said in str(ro.calibration.accept(result, limit))
+    assert said not in str(ro.calibration.accept(ro.calibrate(problem, model="auto"), limit))
+    notes = ro.use.export_files(result, corrections=tmp_path / "none.csv").notes
+    assert "no transmission errors; `compensate` corrects compliance2" in " ".join(notes)
+
+
 def test_of_extensions_at_a_given_weight_files_hold_the_geometry_of_a_formulation_of_ones_own(tmp_path: Path) -> None:
     problem = bent()
     own = ro.Formulation("own", cp.sum_squares, lambda z: cp.sum_squares(z))

@@ -105,6 +105,8 @@ JOINTS = (
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 UR_NUMBERS = {f"{name}{end}": i for i, name in enumerate(UR_JOINTS, start=1) for end in ("", "_joint")}
 """Universal Robots' joints, from the base; ROS lists them alphabetically."""
+EXTERNAL = re.compile(r"e_?1|ext(?:ernal)?_?(?:axis_?)?1?", re.IGNORECASE)
+"""KUKA's external axis, beside which the arm's own joints are counted from 1."""
 MOST_PREFIXES = 6  # words before a known name
 VALUE = frozenset({"position", "pos", "angle", "value"})
 """Word that may follow the name of a joint."""
@@ -222,7 +224,8 @@ def quaternion_columns(read: Meanings, dof: int) -> list[str]:
     for prefix, columns in components.items():
         if sorted(columns) in ([0, 1, 2, 3], [1, 2, 3, 4]):
             others = {each.stem for name, each in read.items() if name not in columns.values()}
-            counted = any(all(f"q{i + first}" in others for i in range(dof)) for first in (0, 1))
+            own = dof - any(map(EXTERNAL.fullmatch, others))
+            counted = any(all(f"q{i + first}" in others for i in range(own)) for first in (0, 1))
             joints = dof == len(columns) or any(re.fullmatch(r"q\d+", stem) for stem in others)
             if prefix != "q" or counted or ({"x", "y", "z"} <= others and not joints):  # these are in another file
                 return [columns[i] for i in sorted(columns)]

@@ -26,7 +26,6 @@ from rpim_opt.robot.mdh import Robot
 TURNED = ("rx", "ry", "rz")
 """Columns of three rotation angles; without a unit they may also be a rotation vector, as of Universal Robots."""
 COORDINATES = {"x", "y", "z"}
-EXTERNAL = re.compile(r"e_?1|ext(?:ernal)?_?(?:axis_?)?1?", re.IGNORECASE)
 ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
 READING = re.compile(r"((?:p|pos|position|meas|measured|shot)?[\s_]*([xyz]))[\s_]*([1-9])", re.IGNORECASE)
 NEAR_READINGS = 0.01  # part of the points' spread within which a row's readings are of one reflector
@@ -340,7 +339,7 @@ def _rename(read: Meanings, new: Mapping[str, str], why: str) -> None:
 
 def _beside_external_axis(read: Meanings, robot: Robot) -> None:
     """Take KUKA's ``E1`` for the only joint that slides, and A1, A2, ... for the others."""
-    axes = [name for name, each in read.items() if EXTERNAL.fullmatch(each.stem)]
+    axes = [name for name, each in read.items() if known_names.EXTERNAL.fullmatch(each.stem)]
     slides = [i for i, kind in enumerate(robot.joint_dimensions, start=1) if kind == "length"]
     missing = {f"q{i}" for i in range(1, robot.dof + 1)} - {each.stem for each in read.values()}
     if len(axes) == len(slides) == 1 and missing == {f"q{robot.dof}"}:
