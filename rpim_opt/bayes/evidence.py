@@ -611,7 +611,18 @@ def without_information(C: Array, taken: Array) -> Array:
     return np.asarray(np.linalg.solve(L, (C[:, some] * B).T).T, dtype=float)
 
 
-def widening(C: Array, factor: float) -> Array:
-    """Return D (p, p), D D' = (factor - 1) C."""
+def widening(C: Array, factor: float, rows: Array) -> Array:
+    """Return D (p, k), C + D D' = ((C^-1 - R'R) / factor + R'R)^-1: all but what rows R (s, p) state is less certain.
+
+    ::
+
+        D = L K^1/2,    L L' = C,    V = L'R',    K = (factor - 1) I - factor V (I / (factor - 1) + V'V)^-1 V'
+    """
+    if factor == 1:
+        return np.zeros((len(C), 0))
     L, d = _factored(C, np.zeros(len(C)))
-    return np.sqrt(factor - 1) * L / d[:, None]
+    L = L / d[:, None]
+    V = (rows @ L).T
+    inner = np.eye(len(rows)) / (factor - 1) + V.T @ V
+    left, U = np.linalg.eigh((factor - 1) * np.eye(len(C)) - factor * V @ np.linalg.solve(inner, V.T))
+    return L @ (U * np.sqrt(np.maximum(left, 0.0)))

@@ -354,7 +354,7 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     drift.append(tail_widening(point.z + C @ (taken * point.z), C, point.v, heavy, scales, prior.tails))
     if not len(prior.spectrum.w2):  # curves have an own prior; a prediction may leave the range of any joint
         factors = evidence.overdispersion(point, fit.problem.joint_values[fit.problem.owners])
-        drift.append(widening(point.C, factors.max()))
+        drift.append(widening(point.C, float(factors.max()), prior.rows))
     curves = None
     if len(prior.spectrum.w2):
         curves = Transmitted(*values[groups:noise], gain=gain)

@@ -400,5 +400,10 @@ def test_what_halves_miss_of_each_other_widens_the_covariance() -> None:
         factor = FACTORS[np.argmin(value)]
         assert (factor > 2) == (lack > 0)
         assert factors.tolist() == [factor, 1]  # a joint that did not move tells nothing
-        D = widening(point.C, factor)
+        D = widening(point.C, factor, np.zeros((0, p)))
         np.testing.assert_allclose(D @ D.T, (factor - 1) * point.C, rtol=1e-6, atol=1e-12)
+        stated = np.array([[0.3, 0.0, -2.0, 0.0, 0.0]])  # what is known besides is as well known as before
+        C = np.linalg.inv(X.T @ X + np.eye(p) + stated.T @ stated)
+        D = widening(C, factor, stated)
+        wide = np.linalg.inv((X.T @ X + np.eye(p)) / factor + stated.T @ stated)
+        np.testing.assert_allclose(C + D @ D.T, wide, rtol=1e-6, atol=1e-12)
