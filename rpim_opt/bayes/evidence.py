@@ -253,7 +253,8 @@ class Point:
             values, U = np.linalg.eigh(part.noise)
             roots = np.sqrt(np.maximum(values, 0.0))[..., None] * U.transpose(0, 1, 3, 2)
             for a, root in enumerate(roots):  # products of a matrix with its own transpose take half the time
-                half = (root @ part.X).reshape(-1, p)
+                counts = values[a].max(axis=0) > RIDGE * values[a].max()  # of six components one noise has three, say
+                half = (root[:, counts] @ part.X).reshape(-1, p)
                 M[a] += half.T @ half
         M = self.C @ M
         return np.einsum("aij,bji->ab", M, M), np.einsum("aij,ji->ia", M, self.C)
