@@ -60,6 +60,7 @@ SCATTERED = 5.0  # residuals of rows over those of others that make them another
 FREE = 1.0  # standard deviation of positions of touched points and planes [m, rad]
 NORMAL, HEAVY, LIKELIER = 1e3, 3.0, 7.0
 """Degrees of freedom of Student's distributions of all rows; log odds at which some are of another kind (1,000:1)."""
+SHOWING = 1.5  # equations of rows over all parameters, from which on their residuals show their noise
 STEADILY = "more and more from row to row"
 JUMPING = 0.5  # mean square step of every joint over that of rows in random order, above which rows have no order
 BENDS = 12  # degree of the polynomial that the side of a rail is
@@ -545,7 +546,8 @@ def scattered_rows(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     heavy, w, _ = fitted(partial(student, HEAVY), w)
     likelihood, w, squares = fitted(two, w)
     far = (w < 0.5) & (count > 0)
-    if likelihood - max(normal, heavy) < LIKELIER or np.count_nonzero(far) < FEW:
+    # hardly more equations than parameters agree with any noise
+    if count[~far].sum() < SHOWING * A.shape[1] or likelihood - max(normal, heavy) < LIKELIER or far.sum() < FEW:
         return
     times = float(np.sqrt(squares[far].sum() / count[far].sum()))
     rows = joined([problem.data.label[i] for i in np.flatnonzero(far)])  # all, as they are to be left out
