@@ -28,7 +28,6 @@ from rpim_opt.calibration.held_out import sets
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import transmission_errors
-from rpim_opt.calibration.verdict import scatter
 from rpim_opt.calibration.words import underdetermined
 from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.problem.blocks import Source
@@ -195,9 +194,9 @@ def export_files(
 def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tuple[str, list[str], list[str], bool]:
     """Return notes for every file and of the geometry, remarks, whether that is inconclusive; or raise NotDelivered."""
     accepted, found = tested(whole)
-    verdict, said = alone.verdict, {"inconclusive": inconclusive(whole, found)}
-    if not scatter(whole):  # residuals of the extensions that are left out, which another note states
-        verdict = replace(verdict, caution=verdict.caution.replace(scatter(alone), "").strip())
+    said = {"inconclusive": inconclusive(whole, found)}
+    # the condition of the whole model: what files cannot hold is no scatter of the readings
+    verdict = replace(alone.verdict, caution=whole.verdict.caution)
     if accepted:
         verdict, said = accepted.on(verdict), {accepted.verdict: accepted.summary}
     remarks = list(filter(None, [whole.no_intervals, said.get("accepted")]))

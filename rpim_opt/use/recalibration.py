@@ -271,7 +271,8 @@ def update(
     released += tuple(name for name in unplaced if name not in released)
     anywhere = bool(base) and {*base} <= {*released}  # a reset base is registered again
     start = None if anywhere else previous_deviations(result, problem)
-    first, updated, released, changes, after = _fewest(result, problem, released, prior_inflation, start, say)
+    in_turn = partial(_in_turn, result, problem, released, prior_inflation, start, say)
+    first, updated, released, changes, after = _fewest(in_turn)
     if not after.likely:
         _refuse_another_robot(result, updated, data, bool({*base} & {*released}))
     vague = _undetermined(updated, set(result.problem.parameters.free.names).difference(released))
@@ -313,19 +314,12 @@ Changed = tuple[Weighed, Calibration, tuple[str, ...], tuple[Cause, ...], Fit]
 discovery, and the fit after them."""
 
 
-def _fewest(
-    result: Calibration,
-    problem: CalibrationProblem,
-    released: tuple[str, ...],
-    inflation: float,
-    start: Array | None,
-    say: Callable[[str], None],
-) -> Changed:
+def _fewest(in_turn: Callable[[bool], Changed]) -> Changed:
     """Return the changes in turn; those with a link, of which several may be one, if they are fewer or alone likely."""
-    found = _in_turn(result, problem, released, inflation, start, say, False)
+    found = in_turn(False)
     if len(found[3]) <= FEW and found[-1].likely:
         return found
-    of_link = _in_turn(result, problem, released, inflation, start, say, True)
+    of_link = in_turn(True)
     fewer = len(of_link[3]) < len(found[3]) or not found[-1].likely
     return of_link if of_link[-1].likely and fewer else found
 
@@ -557,6 +551,7 @@ def _moved(
     w x t + f x s, and its rotation by w x f. A reflector is measured itself, wherever it is: without s.
     """
     free = updated.problem.parameters.free
+    wide = MULTIPLES[-1] * prior_widths(result, updated.problem)
     curves = np.array(free.names)[free.of_curves].tolist()
     # deviations of a registered frame refer to another orientation, values do not
     was, now = (each.problem.parameters.by_name(each.x) for each in (result, updated))
@@ -572,13 +567,13 @@ def _moved(
             change = np.angle(np.exp(1j * change))
         moved.append(Moved(name, free.dimensions[i], float(change), float(std)))
     if not changed:
-        return _known(moved, changed, result, updated)
+        return _known(moved, changed, free, wide)
     index = [free.names.index(name) for name in changed]
     penalty = penalty_of(posterior_as_prior(result, updated.problem, reset), len(free))
     misfit = Misfit(result, updated.problem.linearize(updated.x), penalty)
     g, G = misfit.projected(slice(misfit.m), misfit.A[:, index])
-    wide = MULTIPLES[-1] * prior_widths(result, updated.problem)[index] / free.scale[index]
-    inverse = np.linalg.inv(G + np.diag(wide**-2.0))  # what nothing determines stays within its prior
+    # what nothing determines stays within its prior
+    inverse = np.linalg.inv(G + np.diag((free.scale[index] / wide[index]) ** 2))
     covariance = free.scale[index, None] * inverse * free.scale[index]
     change, std = covariance @ (g / free.scale[index]), np.sqrt(np.diag(covariance))
     frames = np.array(
@@ -595,15 +590,14 @@ def _moved(
         std[at], std[turning] = np.hypot(std[at], np.hypot(w * t, f * s)), np.hypot(std[turning], w * f)
     rows = zip(changed, index, change.tolist(), std.tolist(), strict=True)
     moved += [Moved(name, free.dimensions[i], d, s) for name, i, d, s in rows]
-    return _known(moved, changed, result, updated)
+    return _known(moved, changed, free, wide)
 
 
 def _known(
-    moved: Sequence[Moved], changed: Sequence[str], result: Calibration, updated: Calibration
+    moved: Sequence[Moved], changed: Sequence[str], free: Parameters, wide: Array
 ) -> tuple[tuple[Moved, ...], tuple[str, ...]]:
-    """Return the movements that are better known than by the prior of released parameters, and the others' names."""
-    widths = MULTIPLES[-1] * prior_widths(result, updated.problem)
-    widest = dict(zip(updated.problem.parameters.free.names, widths.tolist(), strict=True))
+    """Return the movements that are better known than by the wide prior (n,) [SI], and the names of the others."""
+    widest = dict(zip(free.names, wide.tolist(), strict=True))
     known = tuple(each for each in moved if each.std < (VAGUE if each.name in changed else 1) * widest[each.name])
     return known, tuple(each.name for each in moved if each not in known)
 
@@ -860,18 +854,22 @@ def readings(problem: CalibrationProblem, model: LinearModel) -> Iterator[tuple[
     With a configuration's equations (k,), and directions (k, j) of the error in standard deviations.
     """
     data, owners = problem.data, problem.owners
-    for number in np.unique(data.configuration):
-        equations, rows = np.flatnonzero(model.group == number), np.flatnonzero(data.configuration == number)
-        labels, every = [data.label[row] for row in rows], np.eye(len(equations))
-        yield Cause(listed(labels), "reading", tuple(labels)), equations, every
-        if len(rows) == 1 or problem.touches is not None:
+    groups = {number: np.flatnonzero(model.group == number) for number in np.unique(data.configuration)}
+    whitened = None
+    if problem.touches is None:  # a unit error of every equation; configurations, which share no noise, together
+        unit = np.zeros((len(owners), max(map(len, groups.values()))))
+        for equations in groups.values():
+            unit[equations, np.arange(len(equations))] = 1.0
+        whitened = problem.whitened(unit)
+    for number, equations in groups.items():
+        rows = np.flatnonzero(data.configuration == number)
+        labels = [data.label[row] for row in rows]
+        yield Cause(listed(labels), "reading", tuple(labels)), equations, np.eye(len(equations))
+        if len(rows) == 1 or whitened is None:
             continue
-        errors = np.zeros((len(owners), len(equations)))
-        errors[equations] = every
-        whitened = problem.whitened(errors)[equations]  # the noise of one is correlated with that of the others
         for row, label in zip(rows, labels, strict=True):
-            own = np.linalg.qr(whitened[:, owners[equations] == row])[0]
-            yield Cause(label, "reading", (label,)), equations, own
+            own = whitened[np.ix_(equations, np.flatnonzero(owners[equations] == row))]
+            yield Cause(label, "reading", (label,)), equations, np.linalg.qr(own)[0]
 
 
 def _weighed(
